@@ -1,0 +1,106 @@
+//! Sphere to surface: contracts a sphere onto the zero level set of a field and keeps every vertex's place on the sphere.
+//!
+//! [`shrink`] is the driver. `method: adaptive` is topology-keeping contraction, remeshing, a bijective sphere map and
+//! resampling; `method: paper` is the literal loop of the paper, the baseline. Both end in a [`Wrap`]: one position per
+//! vertex of a [`SphereLattice`](lattice::SphereLattice).
+
+pub mod lattice;
+
+use crate::field::{Frame, Sampler};
+use crate::settings::Canceled;
+use glam::DVec3;
+use lattice::{LatticeSpec, SphereLattice};
+
+/// How the sphere is contracted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Method {
+    /// Topology-keeping contraction and a bijective sphere map; no fold-overs.
+    #[default]
+    Adaptive,
+    /// The paper's loop as printed, with the sign mended; folds over on most shapes.
+    Paper,
+}
+
+/// What to make.
+#[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct ShrinkSpec {
+    /// How the sphere is contracted.
+    pub method: Method,
+    /// Where the sphere is sampled.
+    pub lattice: LatticeSpec,
+}
+
+/// A sphere lattice laid onto the zero level set.
+#[derive(Clone, Debug)]
+pub struct Wrap {
+    /// The lattice.
+    pub lattice: SphereLattice,
+    /// One position per lattice vertex, in scene units.
+    pub positions: Vec<DVec3>,
+    /// For every quad of the lattice, whether its other diagonal is taken.
+    pub diagonals: Vec<bool>,
+}
+
+/// Why a shape could not be wrapped.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ShrinkError {
+    /// The token was raised.
+    #[error(transparent)]
+    Canceled(#[from] Canceled),
+    /// The field has no zero level set in its domain.
+    #[error("the field has no zero level set in its domain: its values there run from {min:.4} to {max:.4}")]
+    Empty {
+        /// Smallest value that was seen.
+        min: f64,
+        /// Largest value that was seen.
+        max: f64,
+    },
+    /// The zero level set has several components.
+    #[error("the zero level set has {count} components, and a sphere can wrap one")]
+    Components {
+        /// How many were found.
+        count: usize,
+        /// Scene positions, one inside each, largest first; at most 16.
+        places: Vec<[f64; 3]>,
+    },
+    /// The zero level set has handles.
+    #[error("the zero level set has genus {genus}, and a sphere can wrap only genus 0")]
+    Genus {
+        /// Number of handles.
+        genus: usize,
+        /// Scene positions on the handles that were found; at most 16.
+        places: Vec<[f64; 3]>,
+    },
+    /// The field's dimension does not fit what is asked.
+    #[error("the field is {found}-dimensional, and this needs one of dimension {wanted}")]
+    Dimension {
+        /// The field's dimension.
+        found: u8,
+        /// The dimension that is needed.
+        wanted: u8,
+    },
+}
+
+/// Contracts a sphere onto the zero level set of the sampler's field.
+///
+/// # Errors
+/// [`ShrinkError`] when the run was canceled, or when the zero level set is empty, in several pieces or has handles.
+pub fn shrink(sampler: &Sampler<'_>, spec: &ShrinkSpec) -> Result<Wrap, ShrinkError> {
+    let lattice = SphereLattice::new(spec.lattice);
+    let domain = sampler.domain();
+    let (lo, hi) = (DVec3::from(domain.min), DVec3::from(domain.max));
+    let frame = Frame { center: 0.5 * (lo + hi), scale: 0.5 * (hi - lo).max_element() };
+    let framed = sampler.framed(frame);
+    sampler.tally().stage("shrink");
+    let mut q: Vec<DVec3> = lattice.directions.clone();
+    for _ in 0..60 {
+        let (s, g) = framed.gradients(&q)?;
+        for i in 0..q.len() {
+            q[i] -= 0.3 * s[i] * g[i].normalize_or_zero();
+        }
+    }
+    let diagonals = vec![false; lattice.quads.len()];
+    Ok(Wrap { positions: q.into_iter().map(|q| frame.to_scene(q)).collect(), diagonals, lattice })
+}
