@@ -11,9 +11,11 @@ mod intersect;
 mod obj;
 mod off;
 mod ply;
+mod sides;
 mod stl;
 mod text;
 mod topology;
+mod tree;
 mod winding;
 
 pub use distance::MeshField;
