@@ -66,7 +66,8 @@ struct Nearest {
 
 impl MeshField {
     /// Prepares the distance to `mesh`. Triangles that disagree with their neighbours are turned, and all of them if the
-    /// enclosed volume is negative; [`MeshField::soundness`] counts them. The domain is the bounding box grown by 12 %
+    /// enclosed volume is negative; [`MeshField::soundness`] counts them. Patches of a mesh that meets itself which lie
+    /// inside the solid are left out of the distance (though not of [`MeshField::mesh`]). The domain is the bounding box grown by 12 %
     /// of its longest side on each side.
     ///
     /// # Errors
@@ -99,14 +100,6 @@ impl MeshField {
         let vertices: Vec<DVec3> = mesh.vertices.iter().map(|&v| DVec3::from(v) - center).collect();
         let (face_normals, vertex_normals) = normals(&vertices, &mesh.triangles);
         let corners = |triangle: &[u32; 3]| triangle.map(|i| vertices[i as usize]);
-        let (tree, order) = Tree::build(mesh.triangles.iter().map(corners));
-        let triangles = order
-            .iter()
-            .map(|&triangle| {
-                let [a, b, c] = corners(&mesh.triangles[triangle as usize]);
-                Triangle { a, ab: b - a, ac: c - a }
-            })
-            .collect();
         let meets = intersect::find(&vertices, &mesh.triangles);
         soundness.self_intersecting = meets.iter().filter(|&&m| m).count() as u64;
         let winding = OnceLock::new();
@@ -116,6 +109,21 @@ impl MeshField {
         } else {
             None
         };
+        // a buried patch bounds nothing, and would be a false zero inside the solid
+        let is_boundary = |triangle: u32| sides.as_ref().is_none_or(|s| s.0[triangle as usize] != Sides::Buried);
+        let mut kept: Vec<u32> = (0..mesh.triangles.len() as u32).filter(|&t| is_boundary(t)).collect();
+        if kept.is_empty() {
+            kept = (0..mesh.triangles.len() as u32).collect();
+        }
+        let (tree, places) = Tree::build(kept.iter().map(|&t| corners(&mesh.triangles[t as usize])));
+        let order: Vec<u32> = places.into_iter().map(|place| kept[place as usize]).collect();
+        let triangles = order
+            .iter()
+            .map(|&triangle| {
+                let [a, b, c] = corners(&mesh.triangles[triangle as usize]);
+                Triangle { a, ab: b - a, ac: c - a }
+            })
+            .collect();
         let margin = DVec3::splat(MARGIN * longest);
         Ok(Self {
             soundness,

@@ -202,7 +202,12 @@ fn two_spheres_that_run_into_each_other_are_inside_where_either_is() {
         if union.abs() > 0.01 {
             assert_eq!(value > 0.0, union > 0.0, "{value} {union} at {p}");
         }
+        assert!(value < 0.0 || (value - union).abs() < 0.01, "{value} {union} at {p}");
     }
+    // the left sphere's wall deep inside the right one bounds nothing: the nearest boundary is the right sphere's
+    let wall = left + DVec3::new(0.5, 0.0, 0.0);
+    let value = ask(&field, std::iter::once(wall)).remove(0).value;
+    assert!((value - (wall.distance(right) - 0.45)).abs() < 0.01, "{value}");
 }
 
 #[test]
