@@ -201,4 +201,4 @@ fn limit(what: &'static str, found: usize, limit: usize) -> FieldError {
 #[cfg(test)]
 mod readers_tests;
 #[cfg(test)]
-mod tests;
+pub(in crate::field) mod tests;

@@ -325,7 +325,7 @@ fn meshes_that_meet_themselves_have_the_sign_of_their_winding_number() {
 }
 
 /// Nanoseconds that this thread has run: on a busy machine the clock on the wall measures the others.
-fn thread_time() -> f64 {
+pub(in crate::field) fn thread_time() -> f64 {
     let text = std::fs::read_to_string("/proc/thread-self/schedstat").unwrap_or_default();
     text.split_whitespace().next().and_then(|n| n.parse().ok()).unwrap_or(f64::NAN)
 }
