@@ -7,6 +7,7 @@
 mod adaptive;
 mod base;
 mod contract;
+mod creases;
 mod energy;
 mod grid3;
 pub mod lattice;

@@ -2,11 +2,13 @@
 
 use super::base::base;
 use super::contract::{Resolution, contract};
+use super::creases::{choose_diagonals, snap};
 use super::lattice::SphereLattice;
-use super::resample::{choose_diagonals, land, orient};
+use super::resample::{land, orient};
 use super::sphere_map::sphere_map;
+use super::unfold::Corners;
 use super::untangle::Tangle;
-use super::zero::project;
+use super::zero::{OnZero, project};
 use super::{ShrinkError, ShrinkSpec, Wrap};
 use crate::field::Sampler;
 use crate::settings::{Front, Progress};
@@ -90,16 +92,40 @@ fn one(scene: &Sampler<'_>, lattice: &SphereLattice, attempt: &Attempt) -> Resul
     settings.cancel.check()?;
     let edge = (mesh.area() / lattice.directions.len() as f64).sqrt();
     let mut at = project(&sampler, landed.clone(), edge, 1e-3 * edge)?;
-    let normals: Vec<DVec3> = at.gradients.iter().map(|g| g.normalize_or_zero()).collect();
-    let diagonals = choose_diagonals(lattice, &at.positions, &normals);
+    stage("untangle", 0.85, None, None, None);
+    let diagonals = choose_diagonals(&sampler, lattice, &at)?;
     let triangles = lattice.triangles(&diagonals);
-    stage("untangle", 0.9, Some(show(&at.positions, triangles.clone())), None, None);
     let tangle = Tangle::new(&sampler, &triangles, &at.positions);
     let mut folds = tangle.relax_patches(&mut at, &landed, 2)?;
     if folds > 0 {
         folds = tangle.move_single(&mut at)?;
     }
+    stage("sharpen", 0.95, Some(show(&at.positions, triangles.clone())), None, Some(folds as u64));
+    let (folds, at, diagonals) = sharpen(&sampler, lattice, (folds, at, diagonals))?;
     let positions: Vec<DVec3> = at.positions.iter().map(|&p| frame.to_scene(p)).collect();
-    stage("untangle", 1.0, Some(show(&at.positions, triangles)), None, Some(folds as u64));
+    let triangles = lattice.triangles(&diagonals);
+    stage("sharpen", 1.0, Some(show(&at.positions, triangles)), None, Some(folds as u64));
     Ok((folds, Wrap { lattice: lattice.clone(), positions, diagonals }))
+}
+
+/// Moves vertices onto creases and turns diagonals along them; keeps what it was given where that folds more.
+fn sharpen(
+    sampler: &Sampler<'_>,
+    lattice: &SphereLattice,
+    before: (usize, OnZero, Vec<bool>),
+) -> Result<(usize, OnZero, Vec<bool>), ShrinkError> {
+    let mut at = before.1.clone();
+    let triangles = lattice.triangles(&before.2);
+    let corners = Corners::new(at.positions.len(), &triangles);
+    if snap(sampler, &triangles, &corners, &mut at)? == 0 {
+        return Ok(before);
+    }
+    let diagonals = choose_diagonals(sampler, lattice, &at)?;
+    let triangles = lattice.triangles(&diagonals);
+    let tangle = Tangle::new(sampler, &triangles, &at.positions);
+    let mut folds = tangle.folds(&at)?;
+    if folds > before.0 {
+        folds = tangle.move_single(&mut at)?;
+    }
+    Ok(if folds > before.0 { before } else { (folds, at, diagonals) })
 }

@@ -1,5 +1,5 @@
-//! From the base surface and its sphere map to a lattice: where the poles go, where every lattice vertex lands, and which
-//! diagonal every quad takes.
+//! From the base surface and its sphere map to a lattice: where the poles go and where every lattice vertex
+//! lands.
 
 use super::lattice::{LatticeSpec, SphereLattice};
 use super::locate::locate;
@@ -83,29 +83,5 @@ pub fn land(mesh: &Mesh, directions: &[DVec3], lattice: &SphereLattice) -> Vec<D
     locate(mesh, directions, &lattice.directions)
         .into_iter()
         .map(|(t, w)| (0..3).map(|c| w[c] * mesh.positions[t[c] as usize]).sum())
-        .collect()
-}
-
-/// For every quad whether its other diagonal fits the vertex normals better: the one whose worse triangle agrees more.
-pub fn choose_diagonals(lattice: &SphereLattice, positions: &[DVec3], normals: &[DVec3]) -> Vec<bool> {
-    /// The other diagonal must be better by this much, so that even places keep the regular pattern.
-    const GAIN: f64 = 0.01;
-    let agreement = |t: [u32; 3]| {
-        let v = t.map(|k| lattice.chart[k as usize] as usize);
-        let [a, b, c] = v.map(|i| positions[i]);
-        let normal = (b - a).cross(c - a).normalize_or_zero();
-        let corners = v.map(|i| normals[i].dot(normal));
-        // the mean decides on smooth places, the least one at folds
-        corners.iter().sum::<f64>() / 3.0 + corners.iter().copied().fold(f64::INFINITY, f64::min).min(0.0)
-    };
-    lattice
-        .quads
-        .iter()
-        .zip(&lattice.free)
-        .map(|(&[a, b, c, d], &free)| {
-            let first = agreement([a, b, c]).min(agreement([a, c, d]));
-            let other = agreement([a, b, d]).min(agreement([b, c, d]));
-            free && other > first + GAIN
-        })
         .collect()
 }

@@ -199,6 +199,11 @@ impl Rings {
     }
 }
 
+/// Unit normal of a triangle, zero for a degenerate one.
+pub fn unit_normal([a, b, c]: [DVec3; 3]) -> DVec3 {
+    (b - a).cross(c - a).normalize_or_zero()
+}
+
 /// A closed triangle mesh with positions.
 #[derive(Clone, Debug)]
 pub struct Mesh {

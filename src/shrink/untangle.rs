@@ -32,16 +32,19 @@ impl<'a> Tangle<'a> {
     /// Agreement of every triangle with the field at its centroid. The corners' gradients answer for triangles that no
     /// corner doubts; the field is asked about the others. Returns the field's unit normals too.
     fn agreement(&self, at: &OnZero) -> Result<(Vec<f64>, Vec<DVec3>), Canceled> {
-        /// A triangle that agrees this well with each of its corners is not folded.
+        /// A triangle that agrees this well with each of its corners is not folded, if the corners agree among themselves.
         const SURE: f64 = 0.35;
+        /// Length of the mean of three unit normals above which they agree.
+        const EVEN: f64 = 0.9;
         let unit: Vec<DVec3> = at.gradients.iter().map(|g| g.normalize_or_zero()).collect();
         let (mut along, mut targets) = (Vec::new(), Vec::new());
         let (mut asked, mut points) = (Vec::new(), Vec::new());
         for (i, &t) in self.triangles.iter().enumerate() {
             let n = normal(&at.positions, t).normalize_or_zero();
             let least = t.iter().map(|&v| n.dot(unit[v as usize])).fold(f64::INFINITY, f64::min);
-            let mean = t.iter().map(|&v| unit[v as usize]).sum::<DVec3>().normalize_or_zero();
-            if least < SURE {
+            let sum = t.iter().map(|&v| unit[v as usize]).sum::<DVec3>() / 3.0;
+            let mean = sum.normalize_or_zero();
+            if least < SURE || sum.length() < EVEN {
                 asked.push(i);
                 points.push(centroid(&at.positions, t));
             }
@@ -77,7 +80,7 @@ impl<'a> Tangle<'a> {
             let (along, mut targets) = self.agreement(at)?;
             let folded = along.iter().filter(|&&a| a <= 0.0).count();
             if best.as_ref().is_none_or(|b| folded < b.0) {
-                best = Some((folded, copy(at)));
+                best = Some((folded, at.clone()));
             }
             let doubtful = along.iter().any(|&a| a <= DOUBTFUL);
             if !doubtful || (folded == 0 && round > 0) {
@@ -216,10 +219,6 @@ impl<'a> Tangle<'a> {
         }
         Ok(())
     }
-}
-
-fn copy(at: &OnZero) -> OnZero {
-    OnZero { positions: at.positions.clone(), values: at.values.clone(), gradients: at.gradients.clone() }
 }
 
 fn masked(mask: &[bool]) -> Vec<u32> {

@@ -14,6 +14,7 @@ pub fn step_to_zero(value: f64, gradient: DVec3, reach: f64) -> DVec3 {
 }
 
 /// Points on the zero level set with the field there.
+#[derive(Clone, Debug)]
 pub struct OnZero {
     /// Positions, in frame units.
     pub positions: Vec<DVec3>,
