@@ -197,4 +197,6 @@ fn limit(what: &'static str, found: usize, limit: usize) -> FieldError {
 }
 
 #[cfg(test)]
+mod readers_tests;
+#[cfg(test)]
 mod tests;

@@ -46,9 +46,7 @@ pub(super) fn read(bytes: &[u8]) -> Result<Soup, FieldError> {
 }
 
 fn text(bytes: &[u8], mut soup: Soup) -> Result<Soup, FieldError> {
-    // the name behind `solid` may be any words, so the first line is left out
-    let body = bytes.iter().position(|&b| b == b'\n').unwrap_or(bytes.len());
-    let mut words = Words::new(FORMAT, bytes, body, bytes.len());
+    let mut words = Words::new(FORMAT, bytes, 0, bytes.len());
     let mut in_loop = 0;
     let mut ended = false;
     while let Some((at, word)) = words.next() {
@@ -66,7 +64,11 @@ fn text(bytes: &[u8], mut soup: Soup) -> Result<Soup, FieldError> {
                 soup.polygon(&[end - 3, end - 2, end - 1])?;
                 in_loop = 0;
             }
-            b"endsolid" => ended = true,
+            // the name behind these may be any words
+            b"solid" | b"endsolid" => {
+                ended = word == b"endsolid";
+                words.skip_line();
+            }
             _ => {}
         }
     }

@@ -298,3 +298,36 @@ fn pseudo_normals_and_winding_numbers_agree_on_sound_meshes() {
         }
     }
 }
+
+/// Not a claim but a measure: `cargo test --release --lib mesh_query_speed -- --ignored --nocapture`.
+#[test]
+#[ignore = "prints times, claims nothing"]
+fn mesh_query_speed() {
+    for name in ["paper/bunny.ply", "paper/duck.ply", "organic/human_man.ply"] {
+        let Some(bytes) = shared(name) else { return };
+        let start = std::time::Instant::now();
+        let field = MeshField::new(TriangleMesh::read(&bytes).unwrap()).unwrap();
+        let prepared = start.elapsed();
+        let size = (DVec3::from(field.domain().max) - DVec3::from(field.domain().min)).max_element();
+        let near: Vec<DVec3> = (0u32..)
+            .zip(field.mesh().triangles.iter().cycle())
+            .take(40_000)
+            .map(|(i, t)| {
+                t.iter().map(|&v| DVec3::from(field.mesh().vertices[v as usize])).sum::<DVec3>() / 3.0
+                    + 0.02 * size * point(i)
+            })
+            .collect();
+        let mut shuffled = near.clone();
+        shuffled.sort_by_key(|p| (p.x.to_bits() ^ p.y.to_bits()).wrapping_mul(0x9E37_79B9_7F4A_7C15));
+        let anywhere = (0..20_000).map(|i| DVec3::from(field.domain().min) + size * (0.5 * point(i) + 0.5)).collect();
+        for (label, points) in [("in order", near), ("shuffled", shuffled), ("anywhere", anywhere)] {
+            let column = |axis: usize| points.iter().map(|p: &DVec3| p[axis] as f32).collect::<Vec<f32>>();
+            let (x, y, z) = (column(0), column(1), column(2));
+            let mut values = vec![0.0; x.len()];
+            let start = std::time::Instant::now();
+            field.values(Points { x: &x, y: &y, z: &z }, &mut values);
+            let each = start.elapsed().as_secs_f64() * 1e6 / x.len() as f64;
+            println!("{name}, {label}: {each:.2} us a point (prepared in {prepared:?})");
+        }
+    }
+}

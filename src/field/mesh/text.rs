@@ -46,6 +46,13 @@ impl<'a> Words<'a> {
         self.next().ok_or_else(|| malformed(self.format, Some(end), format!("the text ends before {what}")))
     }
 
+    /// Goes to the end of the line.
+    pub fn skip_line(&mut self) {
+        while self.bytes.get(self.at).is_some_and(|&b| b != b'\n') {
+            self.at += 1;
+        }
+    }
+
     /// Where the next word is looked for.
     pub fn position(&self) -> usize {
         self.at

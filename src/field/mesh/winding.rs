@@ -2,14 +2,14 @@
 //! a point, 1 inside a closed surface and 0 outside, and something in between near a hole.
 //!
 //! G. Barill, N. Dickson, R. Schmidt, D. I. W. Levin, A. Jacobson, Fast winding numbers for soups and clouds, 2018. A node
-//! far away counts as its dipole and the first derivative of it; near nodes are opened, and triangles at the leaves count
-//! with their exact solid angle (A. Van Oosterom and J. Strackee, 1983).
+//! far away counts as its dipole; near nodes are opened, and triangles at the leaves count with their exact solid angle (A. Van Oosterom and J. Strackee, 1983).
 
-use glam::{DMat3, DVec3};
+use glam::DVec3;
 use std::f64::consts::PI;
 
-/// A node is opened when the point is nearer to it than this many of its radii; the paper's choice.
-const FAR: f64 = 2.0;
+/// A node is opened when the point is nearer to it than this many of its radii: dipoles alone are then right to about
+/// 0.02, far below the 0.5 that separates inside from outside.
+const FAR: f64 = 3.0;
 /// Triangles in a leaf: solid angles of so few cost about as much as opening one level more.
 const LEAF: usize = 8;
 
@@ -20,8 +20,6 @@ struct Node {
     radius: f64,
     /// Sum of area times normal.
     dipole: DVec3,
-    /// Sum of (area times normal) (centroid - center)^T.
-    spread: DMat3,
     /// First triangle in `order`, and one past the last.
     from: u32,
     to: u32,
@@ -58,11 +56,7 @@ impl Winding {
             let far = FAR * node.radius;
             if distance2 > far * far {
                 let inverse = 1.0 / distance2.sqrt();
-                let inverse3 = inverse * inverse * inverse;
-                // trace(H spread) with H = (I - 3 r r^T / |r|^2) / |r|^3, the second derivative of -1/|r|
-                let trace = node.spread.x_axis.x + node.spread.y_axis.y + node.spread.z_axis.z;
-                let second = trace - 3.0 * r.dot(node.spread * r) / distance2;
-                sum += (node.dipole.dot(r) + second) * inverse3;
+                sum += node.dipole.dot(r) * (inverse * inverse * inverse);
             } else if node.second == 0 {
                 for &[a, b, c] in &self.corners[node.from as usize..node.to as usize] {
                     sum += solid_angle(a - p, b - p, c - p);
@@ -94,15 +88,10 @@ fn build(nodes: &mut Vec<Node>, corners: &mut [[DVec3; 3]], from: usize, to: usi
         (low, high) = (low.min(middle), high.max(middle));
     }
     let center = if area > 0.0 { weighted / area } else { plain / members.len() as f64 };
-    let (mut radius2, mut spread) = (0.0f64, DMat3::ZERO);
-    for t in members.iter() {
-        let (offset, vector) = (centroid(t) - center, vector_area(t));
-        spread += DMat3::from_cols(vector * offset.x, vector * offset.y, vector * offset.z);
-        radius2 = t.iter().fold(radius2, |r, corner| r.max(corner.distance_squared(center)));
-    }
+    let radius2 = members.iter().flatten().fold(0.0f64, |r, corner| r.max(corner.distance_squared(center)));
     let index = nodes.len();
     let (from32, to32) = (from as u32, to as u32);
-    nodes.push(Node { center, radius: radius2.sqrt(), dipole, spread, from: from32, to: to32, second: 0 });
+    nodes.push(Node { center, radius: radius2.sqrt(), dipole, from: from32, to: to32, second: 0 });
     if members.len() > LEAF {
         let axis = (high - low).max_position();
         let middle = members.len() / 2;
@@ -131,12 +120,14 @@ mod tests {
         let mesh = super::super::tests::icosphere(DVec3::ZERO, 1.0, 4);
         let vertices: Vec<DVec3> = mesh.vertices.iter().map(|&v| DVec3::from(v)).collect();
         let winding = Winding::new(&vertices, &mesh.triangles);
+        let mut worst = 0.0f64;
         for i in 0..200 {
             let p = super::super::tests::point(i) * 2.0;
             let exact: f64 = winding.corners.iter().map(|&[a, b, c]| solid_angle(a - p, b - p, c - p)).sum();
             let difference = (winding.number(p) - exact / (4.0 * PI)).abs();
-            // far below the 0.5 that separates inside from outside
-            assert!(difference < 0.02, "{difference} at {p}");
+            worst = worst.max(difference);
         }
+        // far below the 0.5 that separates inside from outside
+        assert!(worst < 0.02, "{worst}");
     }
 }
