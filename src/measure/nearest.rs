@@ -78,6 +78,18 @@ impl Nearest {
         Some(Closest { point, distance_squared, triangle })
     }
 
+    /// Whether some triangle within `radius` of `p` satisfies `wanted`.
+    pub(crate) fn any_within(&self, p: DVec3, radius: f64, mut wanted: impl FnMut(u32) -> bool) -> bool {
+        let mut found = false;
+        let reach = Aabb { min: p - radius, max: p + radius };
+        self.tree.overlapping(&reach, |i| {
+            found = found
+                || (p.distance_squared(closest_on_triangle(p, self.triangles[i as usize])) <= radius * radius
+                    && wanted(i));
+        });
+        found
+    }
+
     /// The closest point to every point, in order, on the settings' pool.
     ///
     /// # Errors

@@ -69,12 +69,31 @@ pub struct Flips {
 /// Distances, in parts of the bounding-box diagonal of the truth.
 #[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
 pub struct Distance {
-    /// Mean over both directions.
+    /// Mean of the two directions' means.
     pub mean: f64,
-    /// Root mean square over both directions.
+    /// Root of the mean of the two directions' mean squares.
     pub rms: f64,
     /// Largest of both directions.
     pub max: f64,
+    /// From samples of the surface to the truth.
+    pub surface_to_truth: OneWay,
+    /// From samples of the truth to the surface.
+    pub truth_to_surface: OneWay,
+}
+
+/// Distances in one direction, in parts of the bounding-box diagonal of the truth, and normals there.
+#[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
+pub struct OneWay {
+    /// Mean, by area.
+    pub mean: f64,
+    /// Root mean square, by area.
+    pub rms: f64,
+    /// Largest, vertices included.
+    pub max: f64,
+    /// Mean of |n . n'|, face normals.
+    pub normal_consistency: f64,
+    /// Mean of n . n', face normals.
+    pub normal_consistency_signed: f64,
 }
 
 /// Distortion of sphere -> surface and of UV -> surface.
