@@ -1,1 +1,2 @@
-//! Not here yet.
+//! (to be written)
+pub(in crate::field) mod npy;
