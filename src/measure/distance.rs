@@ -12,8 +12,10 @@ use crate::settings::{Canceled, Settings};
 use crate::surface::Surface;
 use glam::DVec3;
 
-/// Samples of each surface.
+/// Samples of each surface when the truth is a mesh.
 pub const SAMPLES: usize = 100_000;
+/// Samples of the surface when the truth is a field: each costs several evaluations, of a network perhaps.
+pub const FIELD_SAMPLES: usize = 20_000;
 /// Seeds of the samples of the surface and of the truth: any two that differ.
 const SEEDS: [u64; 2] = [1, 2];
 /// How far from the surface the field's zero set is looked for along the gradient, in parts of the diagonal. Beyond, the
@@ -206,7 +208,7 @@ pub fn to_truth(surface: &Surface, sampler: &Sampler<'_>) -> Result<Option<Compa
             let truth = Mesh { vertices: &truth_vertices, triangles: &truth.triangles };
             between(mesh, truth, SAMPLES, sampler.settings())
         }
-        None => to_field(mesh, SAMPLES, sampler),
+        None => to_field(mesh, FIELD_SAMPLES, sampler),
     }
 }
 

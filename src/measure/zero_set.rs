@@ -34,15 +34,15 @@ const FIRST_BOUNDED: i32 = 16;
 /// The same without a bound: dense enough to meet what the gradient does not announce.
 const FIRST_UNBOUNDED: i32 = 48;
 /// Refinement ends on the level that gives this many points, ...
-const ENOUGH: usize = 24_000;
+const ENOUGH: usize = 10_000;
 /// ... or at this many cells per longest side.
 const FINEST: i32 = 384;
 /// Without a Lipschitz bound, a cell is kept when |s| <= SLACK * |grad s| * half its diagonal.
 const SLACK: f64 = 2.0;
-/// Rounds of bracketed root finding; each at least every second round halves the bracket.
-const ROUNDS: usize = 24;
-/// Share of the grid spacing at which a bracket is tight enough (below single precision over the domain).
-const TIGHT: f64 = 1e-5;
+/// Rounds of bracketed root finding; every third one halves the bracket, so that it ends at 2^-14 of its length at worst.
+const ROUNDS: usize = 42;
+/// Share of the grid spacing to which a root is found: a millionth of the domain, near the end of single precision.
+const TIGHT: f64 = 1e-4;
 
 /// Finds points on the zero level set over the sampler's whole domain.
 ///
@@ -183,27 +183,30 @@ struct Bracket {
     at_to: f64,
 }
 
-/// A root in every bracket, to within `tight`: secant steps in odd rounds, halvings in even ones, so that values that are
-/// no distance cannot stall it.
+impl Bracket {
+    /// The secant's root.
+    fn secant(&self) -> DVec3 {
+        self.from.lerp(self.to, self.at_from / (self.at_from - self.at_to))
+    }
+    /// Whether the root is known to within `tight`: by the bracket's length, or by one end's value over the bracket's slope.
+    fn is_closed(&self, tight: f64) -> bool {
+        let length = self.from.distance(self.to);
+        let (s, t) = (self.at_from.abs(), self.at_to.abs());
+        length <= tight || s.min(t) * length <= tight * (s + t)
+    }
+}
+
+/// A root in every bracket, to within `tight`: two secant steps, one halving, and again, so that values that are no distance
+/// cannot stall it.
 fn roots(mut brackets: Vec<Bracket>, tight: f64, sampler: &Sampler<'_>) -> Result<Vec<DVec3>, Canceled> {
     for round in 0..ROUNDS {
-        let open: Vec<usize> = (0..brackets.len())
-            .filter(|&i| {
-                let b = &brackets[i];
-                b.at_from != 0.0 && b.at_to != 0.0 && b.from.distance_squared(b.to) > tight * tight
-            })
-            .collect();
+        let open: Vec<usize> = (0..brackets.len()).filter(|&i| !brackets[i].is_closed(tight)).collect();
         if open.is_empty() {
             break;
         }
-        let tries: Vec<DVec3> = open
-            .iter()
-            .map(|&i| {
-                let b = &brackets[i];
-                let t = if round % 2 == 0 { b.at_from / (b.at_from - b.at_to) } else { 0.5 };
-                b.from.lerp(b.to, t)
-            })
-            .collect();
+        let halve = round % 3 == 2;
+        let pick = |b: &Bracket| if halve { b.from.midpoint(b.to) } else { b.secant() };
+        let tries: Vec<DVec3> = open.iter().map(|&i| pick(&brackets[i])).collect();
         for (&i, (&x, s)) in open.iter().zip(tries.iter().zip(sampler.values(&tries)?)) {
             let b = &mut brackets[i];
             if (s < 0.0) == (b.at_from < 0.0) {
@@ -213,16 +216,7 @@ fn roots(mut brackets: Vec<Bracket>, tight: f64, sampler: &Sampler<'_>) -> Resul
             }
         }
     }
-    let nearer = |b: &Bracket| {
-        if b.at_from == 0.0 {
-            b.from
-        } else if b.at_to == 0.0 {
-            b.to
-        } else {
-            b.from.lerp(b.to, b.at_from / (b.at_from - b.at_to))
-        }
-    };
-    Ok(brackets.iter().map(nearer).collect())
+    Ok(brackets.iter().map(Bracket::secant).collect())
 }
 
 /// From every start along the field's gradient to the zero level set: Newton steps, none longer than a quarter of `reach`, until
