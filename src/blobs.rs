@@ -241,7 +241,9 @@ mod tests {
 
     #[test]
     fn names_that_are_no_hash_are_refused() {
-        for name in ["sha256:ab", "md5:00", &format!("sha256:{}", "AB".repeat(32)), &format!("sha256:{}", "é".repeat(32))] {
+        for name in
+            ["sha256:ab", "md5:00", &format!("sha256:{}", "AB".repeat(32)), &format!("sha256:{}", "é".repeat(32))]
+        {
             assert_eq!(name.parse::<BlobId>(), Err(InvalidBlobId), "{name}");
         }
     }

@@ -288,7 +288,8 @@ impl Follower {
                 self.pending.push_back(Event::clone(&event));
                 continue;
             }
-            let page = self.engine.events_after(self.id, self.position, PAGE).await.inspect_err(|_| self.over = true)?;
+            let page =
+                self.engine.events_after(self.id, self.position, PAGE).await.inspect_err(|_| self.over = true)?;
             match page {
                 None => self.over = true,
                 Some(page) if page.events.is_empty() => {

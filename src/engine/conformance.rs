@@ -8,7 +8,8 @@
 //! ```
 
 use super::{
-    Claim, Engine, EngineError, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Renewal, Submitted, Update, follow,
+    Claim, Engine, EngineError, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Renewal, Submitted, Update,
+    follow,
 };
 use crate::job::{Event, EventKind, Failure, JobId, JobSpec, Output, ProgressView, State};
 use futures::StreamExt;
@@ -28,7 +29,8 @@ pub fn new_job() -> NewJob {
 
 fn labeled(name: &str, value: &str) -> NewJob {
     let request = json!({"field": {"scene": {"sphere": {"radius": 0.5}}}, "labels": {name: value}});
-    let spec = JobSpec::from_value(&request).unwrap_or_else(|faults| panic!("the suite's own job is refused: {faults:?}"));
+    let spec =
+        JobSpec::from_value(&request).unwrap_or_else(|faults| panic!("the suite's own job is refused: {faults:?}"));
     NewJob { id: JobId::new(), spec, key: None }
 }
 
@@ -320,7 +322,11 @@ async fn only_an_ended_job_is_forgotten(engine: &Arc<dyn Engine>) {
         assert_eq!(engine.forget(claim.id).await.expect("answers"), Forgotten::Running);
         engine.finish(&claim, success("shared")).await.expect("finishes");
     }
-    assert_eq!(engine.forget(ids[0]).await.expect("forgets"), Forgotten::Gone(Vec::new()), "the other job names it too");
+    assert_eq!(
+        engine.forget(ids[0]).await.expect("forgets"),
+        Forgotten::Gone(Vec::new()),
+        "the other job names it too"
+    );
     assert_eq!(engine.forget(ids[1]).await.expect("forgets"), Forgotten::Gone(vec!["shared".to_owned()]));
     assert_eq!(engine.forget(ids[1]).await.expect("answers"), Forgotten::Unknown);
     assert_eq!(engine.get(ids[1]).await.expect("reads"), None);

@@ -9,7 +9,8 @@ mod schema;
 mod writer;
 
 use super::{
-    Changes, Claim, Engine, EngineError, EventPage, Forgotten, ListQuery, NewJob, Outcome, Page, Renewal, Submitted, Update,
+    Changes, Claim, Engine, EngineError, EventPage, Forgotten, ListQuery, NewJob, Outcome, Page, Renewal, Submitted,
+    Update,
 };
 use crate::job::{Failure, Job, JobId, JobSpec, State};
 use records::{Change, Ctx};
@@ -228,11 +229,9 @@ impl Engine for SqliteEngine {
                 return Ok(false);
             }
             let change = match outcome {
-                Outcome::Succeeded { outputs, metrics } => Change {
-                    outputs: Some(outputs),
-                    metrics: Some(metrics),
-                    ..Change::to(State::Succeeded)
-                },
+                Outcome::Succeeded { outputs, metrics } => {
+                    Change { outputs: Some(outputs), metrics: Some(metrics), ..Change::to(State::Succeeded) }
+                }
                 Outcome::Failed(problem) => Change { problem: Some(problem), ..Change::to(State::Failed) },
                 Outcome::Canceled => Change::to(State::Canceled),
                 // a job that is given back while it was to be stopped has stopped

@@ -21,7 +21,11 @@ pub struct FaultView {
 impl FaultView {
     /// The fault, with its pointer moved below `prefix`.
     pub fn below(prefix: &str, fault: &Fault) -> Self {
-        Self { pointer: format!("{prefix}{}", fault.pointer), code: fault.code.to_owned(), detail: fault.detail.clone() }
+        Self {
+            pointer: format!("{prefix}{}", fault.pointer),
+            code: fault.code.to_owned(),
+            detail: fault.detail.clone(),
+        }
     }
 }
 
@@ -73,7 +77,12 @@ impl Failure {
     pub fn is_bad_input(&self) -> bool {
         matches!(
             self.code.as_str(),
-            "invalid_scene" | "unrecognized_input" | "malformed_input" | "over_limit" | "unsupported_input" | "unknown_input"
+            "invalid_scene"
+                | "unrecognized_input"
+                | "malformed_input"
+                | "over_limit"
+                | "unsupported_input"
+                | "unknown_input"
         )
     }
 
@@ -85,7 +94,9 @@ impl Failure {
                 errors: faults.iter().map(|f| FaultView::below(prefix, f)).collect(),
                 ..Self::new("invalid_scene", "the field's description is invalid", detail)
             },
-            FieldError::Unrecognized { .. } => Self::new("unrecognized_input", "the input's format is not known", detail),
+            FieldError::Unrecognized { .. } => {
+                Self::new("unrecognized_input", "the input's format is not known", detail)
+            }
             FieldError::Malformed { .. } => Self::new("malformed_input", "the input breaks its format", detail),
             FieldError::Limit { .. } => Self::new("over_limit", "the input is over a limit", detail),
             FieldError::Unsupported { .. } => {

@@ -32,24 +32,35 @@ pub fn describe(bytes: &[u8]) -> Result<Value, FieldError> {
     Ok(json!({"kind": "scene"}))
 }
 
-/// Opens the field of a request; `input` are the bytes of its uploaded input, if it names one.
+/// Opens the field of a request; `input` are the bytes of the input that it names, if it names one.
 pub fn open(spec: &FieldSpec, input: Option<&[u8]>) -> Result<Box<dyn Field>, Failure> {
-    match (&spec.scene, input) {
-        (Some(scene), _) => {
-            let field = ball(scene).map_err(|e| Failure::from_field(&e, "/field/scene"))?;
-            Ok(Box::new(field))
+    let field = match (&spec.scene, input) {
+        (Some(scene), _) => ball(scene).map_err(|e| Failure::from_field(&e, "/field/scene"))?,
+        (None, Some(bytes)) => {
+            let scene: Value = serde_json::from_slice(bytes).map_err(|e| {
+                Failure::from_field(&FieldError::Unrecognized { detail: format!("expected a scene; {e}") }, "")
+            })?;
+            ball(&scene).map_err(|e| Failure::from_field(&e, ""))?
         }
-        (None, Some(bytes)) => open_file(bytes),
-        (None, None) => Err(Failure::internal()),
-    }
+        (None, None) => return Err(Failure::internal()),
+    };
+    Ok(Box::new(field))
 }
 
-/// Opens a file as a field.
-pub fn open_file(bytes: &[u8]) -> Result<Box<dyn Field>, Failure> {
-    let scene: Value = serde_json::from_slice(bytes).map_err(|e| {
-        Failure::from_field(&FieldError::Unrecognized { detail: format!("expected a scene; {e}") }, "")
-    })?;
-    Ok(Box::new(ball(&scene).map_err(|e| Failure::from_field(&e, ""))?))
+/// What a 2-D field made.
+pub struct CurveMade {
+    /// The curve as a glTF line loop.
+    pub glb: Vec<u8>,
+    /// The curve as SVG.
+    pub svg: Vec<u8>,
+    /// Points of the curve.
+    pub points: usize,
+}
+
+/// Shrinks a circle onto a field of dimension 2.
+pub fn make_curve(field: &dyn Field, _spec: &ShrinkSpec, _settings: Settings<'_>) -> Result<CurveMade, Ended> {
+    let detail = format!("the field is {}-dimensional", field.dimension());
+    Err(Failure::new("dimension", "the field has the wrong dimension for this", detail).into())
 }
 
 /// Shrinks, measures and writes. `load_seconds` is what opening the field took.
@@ -115,7 +126,8 @@ fn ball(scene: &Value) -> Result<Ball, FieldError> {
     if let Some(kind) = object.keys().find(|k| *k != "sphere") {
         return Err(fault(&format!("/{kind}"), "unknown_kind", "unknown kind of node"));
     }
-    let radius = scene["sphere"]["radius"].as_f64().ok_or_else(|| fault("/sphere/radius", "missing_member", "no radius"))?;
+    let radius =
+        scene["sphere"]["radius"].as_f64().ok_or_else(|| fault("/sphere/radius", "missing_member", "no radius"))?;
     Ok(Ball { radius: radius as f32 })
 }
 

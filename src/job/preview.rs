@@ -42,7 +42,11 @@ impl MeshPreview {
         }
         let step: [f32; 3] = std::array::from_fn(|axis| (high[axis] - low[axis]) / f32::from(u16::MAX));
         let quantize = |c: f32, axis: usize| -> u16 {
-            if step[axis] > 0.0 { ((c - low[axis]) / step[axis]).round().clamp(0.0, f32::from(u16::MAX)) as u16 } else { 0 }
+            if step[axis] > 0.0 {
+                ((c - low[axis]) / step[axis]).round().clamp(0.0, f32::from(u16::MAX)) as u16
+            } else {
+                0
+            }
         };
         let mut positions = Vec::with_capacity(6 * front.positions.len());
         for p in &front.positions {

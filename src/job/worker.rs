@@ -328,13 +328,17 @@ mod tests {
         while let Ok(update) = inbox.try_recv() {
             told[usize::from(update.kind == EventKind::Mesh)] += 1;
         }
-        assert!(told[0] <= 1 + elapsed.as_millis() as u32 / 100 && told[1] <= 1 + elapsed.as_millis() as u32 / 250, "{told:?}");
+        assert!(
+            told[0] <= 1 + elapsed.as_millis() as u32 / 100 && told[1] <= 1 + elapsed.as_millis() as u32 / 250,
+            "{told:?}"
+        );
         assert!(told[0] >= 1 && told[1] >= 1);
     }
 
     #[test]
     fn figures_that_are_not_finite_are_left_out() {
-        let view = view(&Progress { fraction: f32::NAN, energy: Some(f64::NAN), ..Progress::default() }, Duration::ZERO);
+        let view =
+            view(&Progress { fraction: f32::NAN, energy: Some(f64::NAN), ..Progress::default() }, Duration::ZERO);
         assert_eq!((view.fraction, view.energy, view.eta_s), (0.0, None, None));
     }
 }

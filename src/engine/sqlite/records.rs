@@ -54,7 +54,8 @@ fn time(ms: i64) -> rusqlite::Result<Timestamp> {
     Timestamp::from_millisecond(ms).map_err(corrupt)
 }
 
-const COLUMNS: &str = "id, state, attempt, revision, created_at, started_at, finished_at, labels, shrink, progress, metrics,
+const COLUMNS: &str =
+    "id, state, attempt, revision, created_at, started_at, finished_at, labels, shrink, progress, metrics,
     outputs, problem, last_seq";
 
 fn job_of(row: &Row<'_>) -> rusqlite::Result<Job> {
@@ -251,11 +252,11 @@ pub(super) fn standing(connection: &Connection, claim: &Claim) -> rusqlite::Resu
 /// Gives the jobs whose lease ran out before `now` back to the queue; one that was to be stopped is, and one that was lost
 /// too often is failed. Returns how many there were.
 pub(super) fn requeue_lost(ctx: &mut Ctx<'_>, now: i64, max_losses: u32) -> rusqlite::Result<usize> {
-    let query = "SELECT id, state, losses FROM jobs WHERE state IN ('running', 'canceling') AND lease_until < ?1 ORDER BY id";
+    let query =
+        "SELECT id, state, losses FROM jobs WHERE state IN ('running', 'canceling') AND lease_until < ?1 ORDER BY id";
     let mut statement = ctx.connection.prepare_cached(query)?;
-    let rows = statement.query_map([now], |row| {
-        Ok((row.get::<_, String>(0)?, row.get::<_, String>(1)?, row.get::<_, u32>(2)?))
-    })?;
+    let rows = statement
+        .query_map([now], |row| Ok((row.get::<_, String>(0)?, row.get::<_, String>(1)?, row.get::<_, u32>(2)?)))?;
     let lost = rows.collect::<rusqlite::Result<Vec<_>>>()?;
     for (text_id, state, losses) in &lost {
         let id: JobId = text_id.parse().map_err(corrupt)?;

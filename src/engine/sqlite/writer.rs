@@ -17,22 +17,36 @@ const BACKLOG: usize = 1024;
 /// Events a slow reader may fall behind before it must ask the engine again.
 const LIVE_EVENTS: usize = 64;
 
+/// Fewest senders that are worth looking through for those that nobody listens to.
+const FEWEST_TO_PRUNE: usize = 256;
+
 /// Who listens to which job.
 #[derive(Default)]
-pub(super) struct Hub(Mutex<HashMap<JobId, broadcast::Sender<Arc<Event>>>>);
+pub(super) struct Hub(Mutex<Listeners>);
+
+#[derive(Default)]
+struct Listeners {
+    senders: HashMap<JobId, broadcast::Sender<Arc<Event>>>,
+    /// Number of senders at which the silent ones are dropped; doubles with those in use, so that subscribing stays cheap.
+    prune_at: usize,
+}
 
 impl Hub {
     pub(super) fn subscribe(&self, id: JobId) -> broadcast::Receiver<Arc<Event>> {
-        let mut senders = self.0.lock().unwrap_or_else(|e| e.into_inner());
-        senders.entry(id).or_insert_with(|| broadcast::channel(LIVE_EVENTS).0).subscribe()
+        let mut hub = self.0.lock().unwrap_or_else(|e| e.into_inner());
+        if hub.senders.len() >= hub.prune_at {
+            hub.senders.retain(|_, sender| sender.receiver_count() > 0);
+            hub.prune_at = FEWEST_TO_PRUNE.max(2 * hub.senders.len());
+        }
+        hub.senders.entry(id).or_insert_with(|| broadcast::channel(LIVE_EVENTS).0).subscribe()
     }
 
     fn publish(&self, events: Vec<(JobId, Arc<Event>)>) {
-        let mut senders = self.0.lock().unwrap_or_else(|e| e.into_inner());
+        let mut hub = self.0.lock().unwrap_or_else(|e| e.into_inner());
         for (id, event) in events {
             // sending fails when nobody listens any more
-            if senders.get(&id).is_some_and(|sender| sender.send(event).is_err()) {
-                senders.remove(&id);
+            if hub.senders.get(&id).is_some_and(|sender| sender.send(event).is_err()) {
+                hub.senders.remove(&id);
             }
         }
     }
@@ -142,10 +156,7 @@ fn write_all(mut connection: Connection, queue: &Receiver<Piece>, hub: &Hub) {
 }
 
 /// Undoes a piece that fails without undoing its neighbours in the group.
-fn in_savepoint<T>(
-    ctx: &mut Ctx<'_>,
-    work: impl FnOnce(&mut Ctx<'_>) -> rusqlite::Result<T>,
-) -> rusqlite::Result<T> {
+fn in_savepoint<T>(ctx: &mut Ctx<'_>, work: impl FnOnce(&mut Ctx<'_>) -> rusqlite::Result<T>) -> rusqlite::Result<T> {
     let told = ctx.events.len();
     ctx.connection.execute_batch("SAVEPOINT piece")?;
     let result = work(ctx);
