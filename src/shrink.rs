@@ -8,6 +8,7 @@ mod adaptive;
 mod base;
 mod contract;
 mod creases;
+mod density;
 mod energy;
 mod grid3;
 pub mod lattice;
