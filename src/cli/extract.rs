@@ -72,7 +72,7 @@ fn extract(args: &ExtractArgs) -> Result<bool, (u8, String)> {
         write(path, bytes)?;
     }
     println!("{}", summary(args, &made, clock.elapsed().as_secs_f64()));
-    Ok(made.sound)
+    Ok(made.is_sound())
 }
 
 /// Which outputs go where, in the order of [`OutputName`].
@@ -113,15 +113,14 @@ fn name(path: &Path) -> std::borrow::Cow<'_, str> {
 
 fn summary(args: &ExtractArgs, made: &Made, seconds: f64) -> String {
     let report = &made.report;
-    let flips = &report["flips"];
-    let flips: u64 = ["surface", "sphere", "uv"].iter().filter_map(|map| flips[*map].as_u64()).sum();
+    let flips = report.flips.surface + report.flips.sphere + report.flips.uv;
     format!(
         "{} -> {}: {} vertices, {:.1} evaluations per vertex, {flips} flips, NC {:.4}, max distance {:.2} %, {seconds:.2} s",
         name(&args.field),
         name(&args.output),
-        report["vertices"],
-        report["evaluations"]["per_vertex"].as_f64().unwrap_or(f64::NAN),
-        report["normal_consistency"].as_f64().unwrap_or(f64::NAN),
-        100.0 * report["distance"]["max"].as_f64().unwrap_or(f64::NAN),
+        report.vertices,
+        report.evaluations.per_vertex,
+        report.normal_consistency,
+        100.0 * report.distance.max,
     )
 }

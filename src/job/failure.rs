@@ -141,6 +141,7 @@ impl From<ShrinkError> for Ended {
             ShrinkError::Genus { places, .. } => {
                 Failure { places, ..Failure::new("genus", "the zero level set has handles", detail) }
             }
+            ShrinkError::Unmapped => Failure::new("unmapped", "the surface could not be mapped to the sphere", detail),
             ShrinkError::Dimension { .. } => {
                 Failure::new("dimension", "the field has the wrong dimension for this", detail)
             }

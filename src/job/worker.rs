@@ -220,7 +220,8 @@ impl Worker {
                 }
             }
         }
-        Outcome::Succeeded { outputs, metrics: made.report }
+        let metrics = serde_json::to_value(&made.report).unwrap_or_default();
+        Outcome::Succeeded { outputs, metrics }
     }
 
     async fn end(&self, claim: &Claim, outcome: Outcome) {
