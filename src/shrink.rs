@@ -4,16 +4,13 @@
 //! resampling; `method: paper` is the literal loop of the paper, the baseline. Both end in a [`Wrap`]: one position per
 //! vertex of a [`SphereLattice`](lattice::SphereLattice).
 
-<<<<<<< HEAD
 mod adaptive;
 mod base;
 mod contract;
 mod creases;
+pub mod curve;
 mod energy;
 mod grid3;
-=======
-pub mod curve;
->>>>>>> scenes
 pub mod lattice;
 mod locate;
 mod paper;

@@ -1,8 +1,9 @@
 //! `shrinkd extract`: one field in, files out, and one line that says how good they are.
 
 use super::{BAD_INPUT, ExtractArgs, FAILED, NOT_WRAPPED, fail};
+use crate::field::input::FieldOptions;
 use crate::job::failure::Ended;
-use crate::job::pipeline::{self, Made};
+use crate::job::pipeline::{self, CurveMade, Made};
 use crate::job::spec::{FieldSpec, OutputName};
 use crate::settings::{CancelToken, Progress, Settings};
 use crate::shrink::ShrinkSpec;
@@ -18,7 +19,10 @@ const STEPS: u64 = 1000;
 pub fn run(args: &ExtractArgs) -> ExitCode {
     match extract(args) {
         Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => fail(FAILED, &"the result did not pass its own checks (closed, Euler characteristic 2, no flips)"),
+        Ok(false) => fail(
+            FAILED,
+            &"the result did not pass its own checks (a surface: closed, Euler characteristic 2, no flips; a curve: closed, simple)",
+        ),
         Err((code, error)) => fail(code, &error),
     }
 }
@@ -27,7 +31,13 @@ pub fn run(args: &ExtractArgs) -> ExitCode {
 fn extract(args: &ExtractArgs) -> Result<bool, (u8, String)> {
     let clock = Instant::now();
     let bytes = std::fs::read(&args.field).map_err(|e| (BAD_INPUT, format!("{}: {e}", args.field.display())))?;
-    let spec = FieldSpec { latent: read_latent(args)?, latent_row: args.latent_row, ..FieldSpec::default() };
+    let options = FieldOptions {
+        latent: read_latent(args)?,
+        latent_row: args.latent_row,
+        domain: args.domain,
+        ..FieldOptions::default()
+    };
+    let spec = FieldSpec { options, ..FieldSpec::default() };
     let in_field = |detail: &str| format!("{}: {detail}", args.field.display());
     let field = pipeline::open(&spec, Some(&bytes)).map_err(|failure| {
         let places: String = failure.errors.iter().map(|e| format!("\n  {}: {}", e.pointer, e.detail)).collect();
@@ -54,15 +64,8 @@ fn extract(args: &ExtractArgs) -> Result<bool, (u8, String)> {
         let svg = args.svg.clone().unwrap_or_else(|| args.output.with_extension("svg"));
         write(&args.output, &made.glb)?;
         write(&svg, &made.svg)?;
-        let seconds = clock.elapsed().as_secs_f64();
-        println!(
-            "{} -> {}, {}: {} points, {seconds:.2} s",
-            name(&args.field),
-            name(&args.output),
-            name(&svg),
-            made.points
-        );
-        return Ok(true);
+        println!("{}", curve_summary(args, &svg, &made, clock.elapsed().as_secs_f64()));
+        return Ok(made.is_sound());
     }
     let files = wanted(args);
     let outputs: Vec<OutputName> = files.iter().map(|(output, _)| *output).collect();
@@ -122,5 +125,19 @@ fn summary(args: &ExtractArgs, made: &Made, seconds: f64) -> String {
         report.evaluations.per_vertex,
         report.normal_consistency,
         100.0 * report.distance.max,
+    )
+}
+
+fn curve_summary(args: &ExtractArgs, svg: &Path, made: &CurveMade, seconds: f64) -> String {
+    let report = &made.report;
+    format!(
+        "{} -> {}, {}: {} samples, {:.1} evaluations per sample, {} self-intersections, max distance {:.2} %, {seconds:.2} s",
+        name(&args.field),
+        name(&args.output),
+        name(svg),
+        report.samples,
+        report.evaluations.total() as f64 / report.samples.max(1) as f64,
+        report.self_intersections,
+        100.0 * report.to_zero_set.max.max(report.from_zero_set.max),
     )
 }

@@ -2,13 +2,16 @@
 
 use super::failure::{Ended, Failure};
 use super::spec::{FieldSpec, OutputName};
+use crate::field::input::{self, Description};
 use crate::field::sampler::Tally;
 use crate::field::scene::Scene;
 use crate::field::{Field, FieldError, Sampler};
 use crate::measure::{self, Report};
 use crate::settings::{Progress, Settings};
+use crate::shrink::curve::{CurveReport, CurveSpec, shrink_curve};
+use crate::shrink::lattice::LatticeSpec;
 use crate::shrink::{ShrinkSpec, shrink};
-use crate::surface::Surface;
+use crate::surface::{self, Surface};
 use serde_json::{Value, json};
 use std::time::Instant;
 
@@ -39,19 +42,22 @@ pub fn check_scene(scene: &Value) -> Result<(), FieldError> {
 }
 
 /// Tells what bytes are, without running them.
-pub fn describe(bytes: &[u8]) -> Result<Value, FieldError> {
-    let scene = Scene::from_slice(bytes)?;
-    Ok(json!({"kind": "scene", "dimension": scene.dimension(), "metric": scene.metric(), "domain": scene.domain()}))
+pub fn describe(bytes: &[u8]) -> Result<Description, FieldError> {
+    input::describe(bytes)
 }
 
-/// Opens the field of a request; `input` are the bytes of the input that it names, if it names one.
-pub fn open(spec: &FieldSpec, input: Option<&[u8]>) -> Result<Box<dyn Field>, Failure> {
-    let scene = match (&spec.scene, input) {
-        (Some(scene), _) => Scene::from_value(scene).map_err(|e| Failure::from_field(&e, "/field/scene"))?,
-        (None, Some(bytes)) => Scene::from_slice(bytes).map_err(|e| Failure::from_field(&e, ""))?,
-        (None, None) => return Err(Failure::internal()),
+/// Opens the field of a request; `bytes` are those of the input that it names, if it names one.
+pub fn open(spec: &FieldSpec, bytes: Option<&[u8]>) -> Result<Box<dyn Field>, Failure> {
+    let scene = match &spec.scene {
+        None => None,
+        Some(scene) => {
+            // read first by itself, so that a later fault is one of the options
+            check_scene(scene).map_err(|e| Failure::from_field(&e, "/field/scene"))?;
+            Some(scene.to_string().into_bytes())
+        }
     };
-    Ok(Box::new(scene))
+    let bytes = scene.as_deref().or(bytes).ok_or_else(Failure::internal)?;
+    input::open(bytes, &spec.options).map_err(|e| Failure::from_field(&e, "/field"))
 }
 
 /// Shrinks, measures and writes. `load_seconds` is what opening the field took.
@@ -127,14 +133,28 @@ pub struct CurveMade {
     pub glb: Vec<u8>,
     /// The curve as SVG.
     pub svg: Vec<u8>,
-    /// Points of the curve.
-    pub points: usize,
+    /// What was measured.
+    pub report: CurveReport,
 }
 
-/// Shrinks a circle onto a field of dimension 2.
-pub fn make_curve(field: &dyn Field, _spec: &ShrinkSpec, _settings: Settings<'_>) -> Result<CurveMade, Ended> {
-    let detail = format!("the field is {}-dimensional", field.dimension());
-    Err(Failure::new("dimension", "the field has the wrong dimension for this", detail).into())
+impl CurveMade {
+    /// Whether the curve passed its own checks: closed and simple.
+    pub fn is_sound(&self) -> bool {
+        self.report.closed && self.report.simple
+    }
+}
+
+/// Shrinks a circle onto a field of dimension 2, with as many samples as a row of the lattice has.
+pub fn make_curve(field: &dyn Field, spec: &ShrinkSpec, settings: Settings<'_>) -> Result<CurveMade, Ended> {
+    let samples = match spec.lattice {
+        LatticeSpec::Latlong { n_theta, .. } => n_theta,
+        LatticeSpec::Octahedral { n } => 4 * n,
+    };
+    let tally = Tally::new();
+    let sampler = Sampler::new(field, settings, &tally);
+    let curve = shrink_curve(&sampler, &CurveSpec { method: spec.method, samples })?;
+    let report = curve.report;
+    Ok(CurveMade { glb: surface::curve::to_glb(&curve), svg: surface::curve::to_svg(&curve).into_bytes(), report })
 }
 
 fn glb(surface: &Surface, report: &Value) -> Vec<u8> {

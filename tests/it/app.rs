@@ -173,7 +173,8 @@ pub fn endless() -> Value {
 /// Checks that an answer is a problem document with this status and code, and returns it.
 pub async fn problem(response: Response, status: u16, code: &str) -> Value {
     assert_eq!(response.headers()["content-type"], "application/problem+json");
-    let (found, id) = (response.status().as_u16(), response.headers()["x-request-id"].to_str().expect("text").to_owned());
+    let (found, id) =
+        (response.status().as_u16(), response.headers()["x-request-id"].to_str().expect("text").to_owned());
     let body: Value = response.json().await.expect("JSON");
     assert_eq!((found, body["code"].as_str()), (status, Some(code)), "{body}");
     assert_eq!(body["type"], format!("urn:shrinkd:problem:{code}"));

@@ -58,7 +58,8 @@ fn exit_codes_tell_usage_from_input_from_shape() {
     let (found, said) = code(r#"{"torus": {"major": 0.5, "minor": 0.2}}"#, &[]);
     assert_eq!(found, Some(4));
     assert!(said.contains("genus"), "{said}");
-    let missing = Command::new(BINARY).args(["extract", "/nowhere/x.json", "-o", "/nowhere/y.glb"]).output().expect("runs");
+    let missing =
+        Command::new(BINARY).args(["extract", "/nowhere/x.json", "-o", "/nowhere/y.glb"]).output().expect("runs");
     assert_eq!(missing.status.code(), Some(3));
 }
 

@@ -52,8 +52,11 @@ async fn a_job_that_was_killed_in_the_middle_runs_again_and_its_reader_misses_no
         let after = follow(&app, &id, Some(last)).await;
         let all = [before, after].concat();
         assert_eq!(all.iter().map(|e| e.0).collect::<Vec<_>>(), (1..=all.len() as u64).collect::<Vec<_>>());
-        let states: Vec<(&str, u64)> =
-            all.iter().filter(|e| e.1 == "state").map(|e| (state(&e.2), e.2["attempt"].as_u64().expect("a number"))).collect();
+        let states: Vec<(&str, u64)> = all
+            .iter()
+            .filter(|e| e.1 == "state")
+            .map(|e| (state(&e.2), e.2["attempt"].as_u64().expect("a number")))
+            .collect();
         assert_eq!(states, [("queued", 0), ("running", 1), ("queued", 1), ("running", 2), ("succeeded", 2)]);
         assert_eq!(all.last().map(|e| e.1.as_str()), Some("done"));
         assert_eq!(follow(&app, &id, Some(0)).await, all, "what was told before the kill is told the same after it");

@@ -45,8 +45,10 @@ struct Metrics {
 
 impl Metrics {
     fn of(report: &Value) -> Self {
-        let number = |pointer: &str| report.pointer(pointer).and_then(Value::as_f64).unwrap_or_else(|| panic!("no {pointer}"));
-        let count = |pointer: &str| report.pointer(pointer).and_then(Value::as_u64).unwrap_or_else(|| panic!("no {pointer}"));
+        let number =
+            |pointer: &str| report.pointer(pointer).and_then(Value::as_f64).unwrap_or_else(|| panic!("no {pointer}"));
+        let count =
+            |pointer: &str| report.pointer(pointer).and_then(Value::as_u64).unwrap_or_else(|| panic!("no {pointer}"));
         Self {
             vertices: count("/vertices"),
             flips: count("/flips/surface") + count("/flips/sphere") + count("/flips/uv"),

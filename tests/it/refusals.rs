@@ -13,7 +13,8 @@ async fn raw(app: &App, body: impl Into<reqwest::Body>) -> reqwest::Response {
 async fn what_is_not_json_is_refused_before_anything_else() {
     let folder = tempfile::tempdir().expect("folder");
     let app = App::start(folder.path());
-    for body in ["", "{", "{\"field\": }", "{\"field\": NaN}", "{\"field\": {\"level\": 1e999}}", "{} {}", "\u{feff}{}"] {
+    for body in ["", "{", "{\"field\": }", "{\"field\": NaN}", "{\"field\": {\"level\": 1e999}}", "{} {}", "\u{feff}{}"]
+    {
         problem(raw(&app, body).await, 400, "malformed_json").await;
     }
     problem(raw(&app, b"{\"a\": \"\xff\"}".to_vec()).await, 400, "malformed_json").await;
@@ -49,11 +50,17 @@ async fn every_fault_of_a_request_is_named_by_its_place() {
     ];
     for (body, pointer, code) in cases {
         let document = problem(app.post("/v1/jobs", &body).await, 422, "invalid_request").await;
-        assert_eq!((&document["errors"][0]["pointer"], &document["errors"][0]["code"]), (&json!(pointer), &json!(code)), "{body}");
+        assert_eq!(
+            (&document["errors"][0]["pointer"], &document["errors"][0]["code"]),
+            (&json!(pointer), &json!(code)),
+            "{body}"
+        );
     }
-    let scene = json!({"field": {"scene": {"union": {"of": [{"sphere": {"radius": 0.5}}, {"blob": {}}, {"sphere": {}}]}}}});
+    let scene =
+        json!({"field": {"scene": {"union": {"of": [{"sphere": {"radius": 0.5}}, {"blob": {}}, {"sphere": {}}]}}}});
     let document = problem(app.post("/v1/jobs", &scene).await, 422, "invalid_request").await;
-    let pointers: Vec<&str> = document["errors"].as_array().expect("a list").iter().filter_map(|e| e["pointer"].as_str()).collect();
+    let pointers: Vec<&str> =
+        document["errors"].as_array().expect("a list").iter().filter_map(|e| e["pointer"].as_str()).collect();
     assert!(pointers.len() >= 2, "both faults: {document}");
     assert!(pointers.iter().all(|p| p.starts_with("/field/scene/union/of/")), "{pointers:?}");
 }
@@ -120,7 +127,17 @@ async fn what_is_not_there_or_not_offered_is_a_problem_too() {
     let allow = put.headers()["allow"].to_str().expect("text").to_owned();
     assert!(allow.contains("GET") && allow.contains("POST"), "{allow}");
     problem(put, 405, "method_not_allowed").await;
-    for query in ["limit=0", "limit=x", "limit=201", "cursor=!", "state=done", "label=x", "created_from=today", "colour=red", "limit=1&limit=2"] {
+    for query in [
+        "limit=0",
+        "limit=x",
+        "limit=201",
+        "cursor=!",
+        "state=done",
+        "label=x",
+        "created_from=today",
+        "colour=red",
+        "limit=1&limit=2",
+    ] {
         problem(app.get(&format!("/v1/jobs?{query}")).await, 400, "invalid_query").await;
     }
     let id = app.submit(&small()).await;
@@ -160,6 +177,7 @@ async fn a_request_keeps_the_id_that_its_client_gave_it() {
 async fn another_origin_is_not_let_in() {
     let folder = tempfile::tempdir().expect("folder");
     let app = App::start(folder.path());
-    let response = app.request(Method::GET, "/livez").header("origin", "http://elsewhere.test").send().await.expect("an answer");
+    let response =
+        app.request(Method::GET, "/livez").header("origin", "http://elsewhere.test").send().await.expect("an answer");
     assert!(!response.headers().contains_key("access-control-allow-origin"));
 }

@@ -62,7 +62,10 @@ async fn a_scene_goes_in_and_a_parameterized_surface_comes_out() {
         let response = app.get(output["href"].as_str().expect("a path")).await;
         assert_eq!(response.status(), StatusCode::OK);
         assert_eq!(response.headers()["content-type"], media_type);
-        assert_eq!(response.headers()["etag"].to_str().expect("text"), format!("\"{}\"", output["sha256"].as_str().expect("hash")));
+        assert_eq!(
+            response.headers()["etag"].to_str().expect("text"),
+            format!("\"{}\"", output["sha256"].as_str().expect("hash"))
+        );
         let bytes = response.bytes().await.expect("bytes");
         assert!(bytes.starts_with(magic), "{name}");
         assert_eq!(output["bytes"], bytes.len());
@@ -115,7 +118,11 @@ async fn events_are_also_had_as_pages() {
         let page: Value = response.expect("an answer").json().await.expect("JSON");
         assert_eq!(page["ended"], true);
         for event in page["events"].as_array().expect("a list") {
-            paged.push((event["seq"].as_u64().expect("number"), event["type"].as_str().expect("kind").to_owned(), event["data"].clone()));
+            paged.push((
+                event["seq"].as_u64().expect("number"),
+                event["type"].as_str().expect("kind").to_owned(),
+                event["data"].clone(),
+            ));
         }
         after = page["next_after"].as_u64().expect("a number");
         if after == page["newest"] {
@@ -166,7 +173,6 @@ async fn a_client_may_wait_for_the_end() {
     assert!(soon.headers().contains_key("retry-after"), "it has not ended, and says when to look again");
     app.post(&format!("/v1/jobs/{id}/cancel"), &json!(null)).await;
 }
-
 
 #[tokio::test]
 async fn the_result_does_not_depend_on_the_number_of_threads() {
