@@ -39,7 +39,7 @@ fn extract(args: &ExtractArgs) -> Result<bool, (u8, String)> {
     };
     let spec = FieldSpec { options, ..FieldSpec::default() };
     let in_field = |detail: &str| format!("{}: {detail}", args.field.display());
-    let field = pipeline::open(&spec, Some(&bytes)).map_err(|failure| {
+    let field = pipeline::open(&spec, Some(&bytes), "").map_err(|failure| {
         let places: String = failure.errors.iter().map(|e| format!("\n  {}: {}", e.pointer, e.detail)).collect();
         (BAD_INPUT, in_field(&format!("{}{places}", failure.detail)))
     })?;

@@ -46,18 +46,19 @@ pub fn describe(bytes: &[u8]) -> Result<Description, FieldError> {
     input::describe(bytes)
 }
 
-/// Opens the field of a request; `bytes` are those of the input that it names, if it names one.
-pub fn open(spec: &FieldSpec, bytes: Option<&[u8]>) -> Result<Box<dyn Field>, Failure> {
+/// Opens the field of a request; `bytes` are those of the input that it names, if it names one. Faults are pointed to
+/// below `at`, the place of the field in the request.
+pub fn open(spec: &FieldSpec, bytes: Option<&[u8]>, at: &str) -> Result<Box<dyn Field>, Failure> {
     let scene = match &spec.scene {
         None => None,
         Some(scene) => {
             // read first by itself, so that a later fault is one of the options
-            check_scene(scene).map_err(|e| Failure::from_field(&e, "/field/scene"))?;
+            check_scene(scene).map_err(|e| Failure::from_field(&e, &format!("{at}/scene")))?;
             Some(scene.to_string().into_bytes())
         }
     };
     let bytes = scene.as_deref().or(bytes).ok_or_else(Failure::internal)?;
-    input::open(bytes, &spec.options).map_err(|e| Failure::from_field(&e, "/field"))
+    input::open(bytes, &spec.options).map_err(|e| Failure::from_field(&e, at))
 }
 
 /// Shrinks, measures and writes. `load_seconds` is what opening the field took.

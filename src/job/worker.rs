@@ -102,7 +102,8 @@ impl Worker {
         let mut work = tokio::spawn(self.work(claim.clone(), cancel.clone(), news).in_current_span());
         let interrupted = self.engine.interrupted(&claim);
         tokio::pin!(interrupted);
-        let mut heartbeat = tokio::time::interval(claim.lease / 3);
+        let beat = claim.lease / 3;
+        let mut heartbeat = tokio::time::interval_at(tokio::time::Instant::now() + beat, beat);
         let (mut lost, mut watching, mut returning) = (false, true, false);
         let result = loop {
             tokio::select! {
@@ -186,7 +187,7 @@ impl Worker {
             let span = tracing::Span::current();
             let compute = move || {
                 let _entered = span.enter();
-                let field = pipeline::open(&claim.spec.field, input.as_deref())?;
+                let field = pipeline::open(&claim.spec.field, input.as_deref(), "/field")?;
                 cancel.check()?;
                 let teller = Teller::new(news);
                 let progress = |progress: Progress| teller.tell(progress);

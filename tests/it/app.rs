@@ -33,7 +33,8 @@ impl App {
     pub fn start_with(folder: &Path, variables: &[(&str, &str)]) -> Self {
         let mut command = Command::new(BINARY);
         command.args(["serve", "--listen", "127.0.0.1:0", "--data"]).arg(folder);
-        command.env("SHRINKD_LOG__FORMAT", "json").envs(variables.iter().copied());
+        // two threads, so that what takes long here takes long on a machine with many cores, too
+        command.env("SHRINKD_LOG__FORMAT", "json").env("SHRINKD_WORKER__THREADS", "2").envs(variables.iter().copied());
         let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("the program starts");
         let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines();
         let log = Arc::new(Mutex::new(String::new()));
@@ -154,11 +155,11 @@ pub fn state(job: &Value) -> &str {
     job["state"].as_str().expect("a state")
 }
 
-/// A job that is done in a moment: a ball on a small lattice.
+/// A job that is done in a moment: a ball on a small lattice, by the method that needs the least.
 pub fn small() -> Value {
     json!({
         "field": {"scene": {"sphere": {"radius": 0.6}}},
-        "shrink": {"lattice": {"latlong": {"n_theta": 32, "n_phi": 16}}},
+        "shrink": {"method": "paper", "lattice": {"latlong": {"n_theta": 32, "n_phi": 16}}},
     })
 }
 

@@ -15,6 +15,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Relative; distances are sampled at fixed places, so that only the surface moves them. A tenth covers what another
 /// processor's rounding does to places where the method decides (a diagonal turned, a vertex moved); a loss is larger.
@@ -102,46 +104,56 @@ fn fields() -> Vec<PathBuf> {
     fields
 }
 
+/// The result of a field, or what the program says about it.
+fn extract(field: &Path) -> Result<Metrics, String> {
+    let folder = tempfile::tempdir().expect("folder");
+    let report = folder.path().join("report.json");
+    let mut command = Command::new(BINARY);
+    command.arg("extract").arg(field).arg("-o").arg(folder.path().join("out.glb")).arg("--report").arg(&report);
+    // the figures do not depend on it, and the fields are spread over the cores already
+    let output = command.args(["--threads", "1"]).output().expect("runs");
+    println!("{}", String::from_utf8_lossy(&output.stdout).trim_end());
+    if !output.status.success() {
+        return Err(String::from_utf8_lossy(&output.stderr).into_owned());
+    }
+    let report: Value = serde_json::from_slice(&std::fs::read(&report).expect("reads")).expect("JSON");
+    Ok(Metrics::of(&report))
+}
+
+/// Compares a result with the stored one, or stores it.
+fn check(field: &Path, renew: bool) -> Vec<String> {
+    let name = field.file_stem().expect("a name").to_string_lossy().into_owned();
+    let stored_in = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/metrics");
+    let path = stored_in.join(format!("{name}.json"));
+    let losses = match (extract(field), std::fs::read(&path)) {
+        (Err(error), _) => vec![error],
+        (Ok(found), _) if renew => {
+            std::fs::create_dir_all(&stored_in).expect("a folder");
+            std::fs::write(&path, serde_json::to_string_pretty(&found).expect("JSON") + "\n").expect("writes");
+            Vec::new()
+        }
+        (Ok(found), Ok(stored)) => found.losses(&serde_json::from_slice(&stored).expect("stored metrics")),
+        (Ok(_), Err(_)) => vec!["no stored metrics; renew them as the head of this file says".to_owned()],
+    };
+    losses.into_iter().map(|loss| format!("{name}: {loss}")).collect()
+}
+
 #[test]
 fn results_are_as_good_as_the_stored_metrics() {
     let renew = std::env::var_os("SHRINKD_RENEW_METRICS").is_some();
-    let stored_in = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/metrics");
-    let folder = tempfile::tempdir().expect("folder");
     let fields = fields();
     assert!(fields.len() >= 10, "the example scenes are there");
-    let mut losses = Vec::new();
-    for field in fields {
-        let name = field.file_stem().expect("a name").to_string_lossy().into_owned();
-        let report = folder.path().join("report.json");
-        let output = Command::new(BINARY)
-            .arg("extract")
-            .arg(&field)
-            .arg("-o")
-            .arg(folder.path().join("out.glb"))
-            .arg("--report")
-            .arg(&report)
-            .output()
-            .expect("runs");
-        print!("{}", String::from_utf8_lossy(&output.stdout));
-        if !output.status.success() {
-            losses.push(format!("{name}: {}", String::from_utf8_lossy(&output.stderr)));
-            continue;
+    let (next, losses) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    std::thread::scope(|scope| {
+        for _ in 0..cores {
+            scope.spawn(|| {
+                while let Some(field) = fields.get(next.fetch_add(1, Ordering::Relaxed)) {
+                    losses.lock().expect("no panic").extend(check(field, renew));
+                }
+            });
         }
-        let report: Value = serde_json::from_slice(&std::fs::read(&report).expect("reads")).expect("JSON");
-        let found = Metrics::of(&report);
-        let path = stored_in.join(format!("{name}.json"));
-        if renew {
-            std::fs::create_dir_all(&stored_in).expect("a folder");
-            std::fs::write(&path, serde_json::to_string_pretty(&found).expect("JSON") + "\n").expect("writes");
-            continue;
-        }
-        match std::fs::read(&path) {
-            Ok(stored) => {
-                let stored: Metrics = serde_json::from_slice(&stored).expect("stored metrics");
-                losses.extend(found.losses(&stored).into_iter().map(|loss| format!("{name}: {loss}")));
-            }
-            Err(_) => losses.push(format!("{name}: no stored metrics; renew them as the head of this file says")),
-        }
-    }
+    });
+    let losses = losses.into_inner().expect("no panic");
     assert!(losses.is_empty(), "{}", losses.join("\n"));
 }
