@@ -9,6 +9,7 @@ mod base;
 mod contract;
 mod creases;
 pub mod curve;
+mod density;
 mod energy;
 mod grid3;
 pub mod lattice;

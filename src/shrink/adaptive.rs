@@ -3,6 +3,7 @@
 use super::base::base;
 use super::contract::{Resolution, contract};
 use super::creases::{choose_diagonals, snap};
+use super::density::density;
 use super::lattice::SphereLattice;
 use super::resample::{land, orient};
 use super::sphere_map::sphere_map;
@@ -85,7 +86,7 @@ fn one(scene: &Sampler<'_>, lattice: &SphereLattice, attempt: &Attempt) -> Resul
     let sampler = scene.framed(frame);
     let (mesh, folded) = base(front, attempt.base_vertices, &sampler)?;
     stage("map", 0.45, Some(show(&mesh.positions, mesh.rings.triangles())), None, Some(folded as u64));
-    let map = sphere_map(&mesh, BETA, settings.cancel)?.ok_or(ShrinkError::Unmapped)?;
+    let map = sphere_map(&mesh, &density(&mesh), BETA, settings.cancel)?.ok_or(ShrinkError::Unmapped)?;
     stage("resample", 0.75, None, Some(map.energy), None);
     let directions = orient(&mesh, &map.directions, lattice.spec);
     let landed = land(&mesh, &directions, lattice);

@@ -32,17 +32,28 @@ pub struct SphereMap {
     pub energy: f64,
 }
 
-/// Maps `mesh` to the sphere; every spherical triangle is positively oriented. `beta` weighs area against angle.
-/// `None` when the mesh cannot be decimated to a tetrahedron or an insertion finds no kernel.
-pub fn sphere_map(mesh: &Mesh, beta: f64, cancel: &CancelToken) -> Result<Option<SphereMap>, Canceled> {
+/// Maps `mesh` to the sphere; every spherical triangle is positively oriented. `beta` weighs area against angle;
+/// `density` is the share of the sphere per area that every vertex asks for, up to a common factor. `None` when the mesh cannot be decimated to a tetrahedron or an insertion finds no kernel.
+pub fn sphere_map(
+    mesh: &Mesh,
+    density: &[f64],
+    beta: f64,
+    cancel: &CancelToken,
+) -> Result<Option<SphereMap>, Canceled> {
     let mut rings = mesh.rings.clone();
     let Some(log) = decimate(mesh, &mut rings, cancel)? else {
         return Ok(None);
     };
     let n = mesh.positions.len();
-    let scale = (4.0 * PI / mesh.area()).sqrt();
+    let weighted: f64 = mesh
+        .rings
+        .triangles()
+        .into_iter()
+        .map(|t| 0.5 * mesh.normal(t).length() * t.iter().map(|&v| density[v as usize]).sum::<f64>() / 3.0)
+        .sum();
+    let scales = density.iter().map(|d| d * 4.0 * PI / weighted).collect();
     let mut map =
-        Relaxer { positions: &mesh.positions, directions: vec![DVec3::ZERO; n], rings, scale, beta, star: Vec::new() };
+        Relaxer { positions: &mesh.positions, directions: vec![DVec3::ZERO; n], rings, scales, beta, star: Vec::new() };
     let mut active: Vec<u32> = (0..n as u32).filter(|&v| map.rings.alive(v)).collect();
     let top = active[0];
     map.directions[top as usize] = DVec3::Z;
@@ -60,8 +71,10 @@ pub fn sphere_map(mesh: &Mesh, beta: f64, cancel: &CancelToken) -> Result<Option
         map.rings.uncollapse(*v, ring);
         active.push(*v);
         map.settle(*v, ring, active.len());
-        if active.len() >= next_sweep && active.len() < n {
+        if active.len().is_multiple_of(256) {
             cancel.check()?;
+        }
+        if active.len() >= next_sweep && active.len() < n {
             next_sweep = (active.len() as f64 * GROWTH).ceil() as usize + 1;
             map.sweep(&active, if active.len() < 500 { 4 * SWEEPS.0 } else { SWEEPS.0 }, cancel)?;
         }
@@ -225,7 +238,8 @@ struct Relaxer<'a> {
     positions: &'a [DVec3],
     directions: Vec<DVec3>,
     rings: Rings,
-    scale: f64,
+    /// Squared lengths on the sphere per squared length on the mesh, at every vertex.
+    scales: Vec<f64>,
     beta: f64,
     star: Vec<Wedge>,
 }
@@ -238,10 +252,11 @@ impl Relaxer<'_> {
         for (i, &b) in ring.iter().enumerate() {
             let c = ring[(i + 1) % ring.len()];
             let corners = [here, self.positions[b as usize], self.positions[c as usize]];
+            let scale = (self.scales[v as usize] + self.scales[b as usize] + self.scales[c as usize]) / 3.0;
             self.star.push(Wedge {
                 b: self.directions[b as usize],
                 c: self.directions[c as usize],
-                reference: Reference::new(corners, self.scale, SOFTENING),
+                reference: Reference::new(corners, scale.sqrt(), SOFTENING),
             });
         }
     }
