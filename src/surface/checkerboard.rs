@@ -73,7 +73,7 @@ pub(crate) fn png(rgb: &[u8], width: u32, height: u32) -> Vec<u8> {
     use image::ImageEncoder;
     use image::codecs::png::{CompressionType, FilterType, PngEncoder};
     let mut bytes = Vec::new();
-    PngEncoder::new_with_quality(&mut bytes, CompressionType::Best, FilterType::Adaptive)
+    PngEncoder::new_with_quality(&mut bytes, CompressionType::Default, FilterType::Adaptive)
         .write_image(rgb, width, height, image::ExtendedColorType::Rgb8)
         .expect("a buffer of the stated size, written to memory");
     bytes
