@@ -1,1 +1,1 @@
-//! it
+//! Tests of the whole program, from outside.
