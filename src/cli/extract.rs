@@ -39,7 +39,7 @@ fn extract(args: &ExtractArgs) -> Result<bool, (u8, String)> {
     };
     let spec = FieldSpec { options, ..FieldSpec::default() };
     let in_field = |detail: &str| format!("{}: {detail}", args.field.display());
-    let field = pipeline::open(&spec, Some(&bytes), "").map_err(|failure| {
+    let opened = pipeline::open(&spec, Some(&bytes), "").map_err(|failure| {
         let places: String = failure.errors.iter().map(|e| format!("\n  {}: {}", e.pointer, e.detail)).collect();
         (BAD_INPUT, in_field(&format!("{}{places}", failure.detail)))
     })?;
@@ -58,8 +58,8 @@ fn extract(args: &ExtractArgs) -> Result<bool, (u8, String)> {
         Ended::Failed(failure) => (NOT_WRAPPED, in_field(&format!("{} ({})", failure.detail, failure.code))),
         Ended::Canceled => (FAILED, "canceled".to_owned()),
     };
-    if field.dimension() == 2 {
-        let made = pipeline::make_curve(field.as_ref(), &shrink, settings).map_err(ended)?;
+    if opened.field.dimension() == 2 {
+        let made = pipeline::make_curve(opened.field.as_ref(), &shrink, settings).map_err(ended)?;
         bar.finish_and_clear();
         let svg = args.svg.clone().unwrap_or_else(|| args.output.with_extension("svg"));
         write(&args.output, &made.glb)?;
@@ -69,7 +69,7 @@ fn extract(args: &ExtractArgs) -> Result<bool, (u8, String)> {
     }
     let files = wanted(args);
     let outputs: Vec<OutputName> = files.iter().map(|(output, _)| *output).collect();
-    let made = pipeline::make(field.as_ref(), &shrink, &outputs, load, settings).map_err(ended)?;
+    let made = pipeline::make(&opened, &shrink, &outputs, load, settings).map_err(ended)?;
     bar.finish_and_clear();
     for ((_, path), (_, bytes)) in files.iter().zip(&made.files) {
         write(path, bytes)?;

@@ -2,6 +2,7 @@
 
 use super::failure::{Ended, Failure};
 use super::spec::{FieldSpec, OutputName};
+use crate::blobs::BlobId;
 use crate::field::input::{self, Description};
 use crate::field::sampler::Tally;
 use crate::field::scene::Scene;
@@ -19,6 +20,17 @@ use std::time::Instant;
 const SHRINK_SHARE: f32 = 0.75;
 /// Share of a job's time that is over when the outputs are written.
 const MEASURED_SHARE: f32 = 0.95;
+
+/// Sides of the preview, pixels.
+const PREVIEW_WIDTH: u32 = 1024;
+
+/// A field, and where it came from.
+pub struct Opened {
+    /// The field.
+    pub field: Box<dyn Field>,
+    /// The hash and the size of its bytes, and the options; written into the GLB.
+    pub provenance: Value,
+}
 
 /// What a job made.
 pub struct Made {
@@ -48,7 +60,7 @@ pub fn describe(bytes: &[u8]) -> Result<Description, FieldError> {
 
 /// Opens the field of a request; `bytes` are those of the input that it names, if it names one. Faults are pointed to
 /// below `at`, the place of the field in the request.
-pub fn open(spec: &FieldSpec, bytes: Option<&[u8]>, at: &str) -> Result<Box<dyn Field>, Failure> {
+pub fn open(spec: &FieldSpec, bytes: Option<&[u8]>, at: &str) -> Result<Opened, Failure> {
     let scene = match &spec.scene {
         None => None,
         Some(scene) => {
@@ -58,14 +70,17 @@ pub fn open(spec: &FieldSpec, bytes: Option<&[u8]>, at: &str) -> Result<Box<dyn 
         }
     };
     let bytes = scene.as_deref().or(bytes).ok_or_else(Failure::internal)?;
-    input::open(bytes, &spec.options).map_err(|e| Failure::from_field(&e, at))
+    let field = input::open(bytes, &spec.options).map_err(|e| Failure::from_field(&e, at))?;
+    // the bytes of a scene in a request are its JSON without spaces, members in alphabetical order
+    let provenance = json!({"sha256": BlobId::of(bytes).hex(), "bytes": bytes.len(), "options": spec.options});
+    Ok(Opened { field, provenance })
 }
 
 /// Shrinks, measures and writes. `load_seconds` is what opening the field took.
 ///
 /// Every output but the report is the same for the same request, whatever the clock and the number of threads say.
 pub fn make(
-    field: &dyn Field,
+    opened: &Opened,
     spec: &ShrinkSpec,
     outputs: &[OutputName],
     load_seconds: f64,
@@ -78,7 +93,7 @@ pub fn make(
         (settings.progress)(Progress { stage, fraction, ..Progress::default() });
     };
     let tally = Tally::new();
-    let sampler = Sampler::new(field, Settings { progress: &told, ..settings }, &tally);
+    let sampler = Sampler::new(opened.field.as_ref(), Settings { progress: &told, ..settings }, &tally);
     let clock = Instant::now();
     let wrap = shrink(&sampler, spec)?;
     let spent = tally.by_stage();
@@ -99,9 +114,9 @@ pub fn make(
     for &output in outputs {
         settings.cancel.check()?;
         let bytes = match output {
-            OutputName::Glb => glb(&surface, &lasting),
-            OutputName::Surface => surface.values.iter().flat_map(|v| v.to_le_bytes()).collect(),
-            OutputName::Preview => b"\x89PNG\r\n\x1a\n".to_vec(),
+            OutputName::Glb => surface::gltf::to_glb(&surface, &lasting, &opened.provenance),
+            OutputName::Surface => surface::tensors::to_safetensors(&surface),
+            OutputName::Preview => surface::preview::to_png(&surface, PREVIEW_WIDTH, &settings)?,
             OutputName::Report => {
                 report.seconds.write = clock.elapsed().as_secs_f64();
                 pretty(&report)
@@ -156,20 +171,4 @@ pub fn make_curve(field: &dyn Field, spec: &ShrinkSpec, settings: Settings<'_>) 
     let curve = shrink_curve(&sampler, &CurveSpec { method: spec.method, samples })?;
     let report = curve.report;
     Ok(CurveMade { glb: surface::curve::to_glb(&curve), svg: surface::curve::to_svg(&curve).into_bytes(), report })
-}
-
-fn glb(surface: &Surface, report: &Value) -> Vec<u8> {
-    let mut json = json!({"asset": {"version": "2.0", "extras": report}}).to_string().into_bytes();
-    json.resize(json.len().next_multiple_of(4), b' ');
-    let mut bin: Vec<u8> = surface.positions.iter().flatten().flat_map(|c| c.to_le_bytes()).collect();
-    bin.resize(bin.len().next_multiple_of(4), 0);
-    let mut glb = b"glTF".to_vec();
-    for word in [2, (28 + json.len() + bin.len()) as u32, json.len() as u32, u32::from_le_bytes(*b"JSON")] {
-        glb.extend_from_slice(&word.to_le_bytes());
-    }
-    glb.extend_from_slice(&json);
-    glb.extend_from_slice(&(bin.len() as u32).to_le_bytes());
-    glb.extend_from_slice(b"BIN\0");
-    glb.extend_from_slice(&bin);
-    glb
 }

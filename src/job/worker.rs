@@ -187,13 +187,13 @@ impl Worker {
             let span = tracing::Span::current();
             let compute = move || {
                 let _entered = span.enter();
-                let field = pipeline::open(&claim.spec.field, input.as_deref(), "/field")?;
+                let opened = pipeline::open(&claim.spec.field, input.as_deref(), "/field")?;
                 cancel.check()?;
                 let teller = Teller::new(news);
                 let progress = |progress: Progress| teller.tell(progress);
                 let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress };
                 let load = clock.elapsed().as_secs_f64();
-                pipeline::make(field.as_ref(), &claim.spec.shrink, &claim.spec.outputs, load, settings)
+                pipeline::make(&opened, &claim.spec.shrink, &claim.spec.outputs, load, settings)
             };
             tokio::task::spawn_blocking(compute).await.unwrap_or_else(|panic| {
                 tracing::error!(%panic, "the computation panicked");

@@ -23,7 +23,7 @@ async fn every_operation_is_described_with_its_problems() {
     for (path, item) in document["paths"].as_object().expect("paths") {
         for (method, operation) in item.as_object().expect("operations") {
             assert!(operation["summary"].is_string(), "{method} {path} has no summary");
-            assert!(names.insert(operation["operationId"].clone()), "{method} {path} shares its name");
+            assert!(names.insert(operation["operationId"].to_string()), "{method} {path} shares its name");
             for (status, response) in operation["responses"].as_object().expect("responses") {
                 if status.starts_with(['4', '5']) {
                     let problem = &response["content"]["application/problem+json"]["schema"]["$ref"];
