@@ -7,6 +7,8 @@ pub mod extract;
 pub mod healthcheck;
 pub mod serve;
 
+use crate::field::Domain;
+use crate::field::input::{DomainName, DomainOption};
 use crate::shrink::Method;
 use crate::shrink::lattice::LatticeSpec;
 use clap::{Args, Parser, Subcommand, ValueEnum};
@@ -80,6 +82,9 @@ pub struct ExtractArgs {
     /// Row of the input's own table of latent codes
     #[arg(long, value_name = "N")]
     pub latent_row: Option<u32>,
+    /// Box that holds the zero level set (of a grid: that its samples span): fit, or X0,Y0,Z0,X1,Y1,Z1
+    #[arg(long, value_name = "BOX", value_parser = parse_domain, allow_hyphen_values = true)]
+    pub domain: Option<DomainOption>,
     /// Where the report goes (JSON)
     #[arg(long, value_name = "R.json")]
     pub report: Option<PathBuf>,
@@ -131,6 +136,17 @@ fn parse_lattice(text: &str) -> Result<LatticeSpec, String> {
         Some(fault) => Err(format!("{}: {}", fault.pointer.trim_start_matches('/'), fault.detail)),
         None => Ok(lattice),
     }
+}
+
+/// `fit`, or six numbers.
+fn parse_domain(text: &str) -> Result<DomainOption, String> {
+    if text == "fit" {
+        return Ok(DomainOption::Named(DomainName::Fit));
+    }
+    let expected = "expected fit or X0,Y0,Z0,X1,Y1,Z1";
+    let corners: Vec<f64> = text.split(',').map(str::parse).collect::<Result<_, _>>().map_err(|_| expected)?;
+    let [x0, y0, z0, x1, y1, z1] = corners[..] else { return Err(expected.to_owned()) };
+    Ok(DomainOption::Box(Domain { min: [x0, y0, z0], max: [x1, y1, z1] }))
 }
 
 /// Runs the command line of this process.

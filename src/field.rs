@@ -46,7 +46,7 @@ pub struct Gradients<'a> {
 }
 
 /// An axis-aligned box in scene units that holds the zero level set.
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Domain {
     /// Corner with the smallest coordinates.
@@ -63,7 +63,9 @@ impl Default for Domain {
 }
 
 /// How far a field's values can be trusted.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, serde::Serialize, serde::Deserialize)]
+#[derive(
+    Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, serde::Serialize, serde::Deserialize, utoipa::ToSchema,
+)]
 #[serde(rename_all = "snake_case")]
 pub enum Metric {
     /// The value is the Euclidean distance to the zero level set.

@@ -8,6 +8,7 @@ mod adaptive;
 mod base;
 mod contract;
 mod creases;
+pub mod curve;
 mod density;
 mod energy;
 mod grid3;

@@ -1,8 +1,9 @@
 //! `shrinkd extract`: one field in, files out, and one line that says how good they are.
 
 use super::{BAD_INPUT, ExtractArgs, FAILED, NOT_WRAPPED, fail};
+use crate::field::input::FieldOptions;
 use crate::job::failure::Ended;
-use crate::job::pipeline::{self, Made};
+use crate::job::pipeline::{self, CurveMade, Made};
 use crate::job::spec::{FieldSpec, OutputName};
 use crate::settings::{CancelToken, Progress, Settings};
 use crate::shrink::ShrinkSpec;
@@ -18,7 +19,10 @@ const STEPS: u64 = 1000;
 pub fn run(args: &ExtractArgs) -> ExitCode {
     match extract(args) {
         Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => fail(FAILED, &"the result did not pass its own checks (closed, Euler characteristic 2, no flips)"),
+        Ok(false) => fail(
+            FAILED,
+            &"the result did not pass its own checks (a surface: closed, Euler characteristic 2, no flips; a curve: closed, simple)",
+        ),
         Err((code, error)) => fail(code, &error),
     }
 }
@@ -27,9 +31,15 @@ pub fn run(args: &ExtractArgs) -> ExitCode {
 fn extract(args: &ExtractArgs) -> Result<bool, (u8, String)> {
     let clock = Instant::now();
     let bytes = std::fs::read(&args.field).map_err(|e| (BAD_INPUT, format!("{}: {e}", args.field.display())))?;
-    let spec = FieldSpec { latent: read_latent(args)?, latent_row: args.latent_row, ..FieldSpec::default() };
+    let options = FieldOptions {
+        latent: read_latent(args)?,
+        latent_row: args.latent_row,
+        domain: args.domain,
+        ..FieldOptions::default()
+    };
+    let spec = FieldSpec { options, ..FieldSpec::default() };
     let in_field = |detail: &str| format!("{}: {detail}", args.field.display());
-    let field = pipeline::open(&spec, Some(&bytes)).map_err(|failure| {
+    let opened = pipeline::open(&spec, Some(&bytes), "").map_err(|failure| {
         let places: String = failure.errors.iter().map(|e| format!("\n  {}: {}", e.pointer, e.detail)).collect();
         (BAD_INPUT, in_field(&format!("{}{places}", failure.detail)))
     })?;
@@ -48,31 +58,24 @@ fn extract(args: &ExtractArgs) -> Result<bool, (u8, String)> {
         Ended::Failed(failure) => (NOT_WRAPPED, in_field(&format!("{} ({})", failure.detail, failure.code))),
         Ended::Canceled => (FAILED, "canceled".to_owned()),
     };
-    if field.dimension() == 2 {
-        let made = pipeline::make_curve(field.as_ref(), &shrink, settings).map_err(ended)?;
+    if opened.field.dimension() == 2 {
+        let made = pipeline::make_curve(opened.field.as_ref(), &shrink, settings).map_err(ended)?;
         bar.finish_and_clear();
         let svg = args.svg.clone().unwrap_or_else(|| args.output.with_extension("svg"));
         write(&args.output, &made.glb)?;
         write(&svg, &made.svg)?;
-        let seconds = clock.elapsed().as_secs_f64();
-        println!(
-            "{} -> {}, {}: {} points, {seconds:.2} s",
-            name(&args.field),
-            name(&args.output),
-            name(&svg),
-            made.points
-        );
-        return Ok(true);
+        println!("{}", curve_summary(args, &svg, &made, clock.elapsed().as_secs_f64()));
+        return Ok(made.is_sound());
     }
     let files = wanted(args);
     let outputs: Vec<OutputName> = files.iter().map(|(output, _)| *output).collect();
-    let made = pipeline::make(field.as_ref(), &shrink, &outputs, load, settings).map_err(ended)?;
+    let made = pipeline::make(&opened, &shrink, &outputs, load, settings).map_err(ended)?;
     bar.finish_and_clear();
     for ((_, path), (_, bytes)) in files.iter().zip(&made.files) {
         write(path, bytes)?;
     }
     println!("{}", summary(args, &made, clock.elapsed().as_secs_f64()));
-    Ok(made.sound)
+    Ok(made.is_sound())
 }
 
 /// Which outputs go where, in the order of [`OutputName`].
@@ -113,15 +116,28 @@ fn name(path: &Path) -> std::borrow::Cow<'_, str> {
 
 fn summary(args: &ExtractArgs, made: &Made, seconds: f64) -> String {
     let report = &made.report;
-    let flips = &report["flips"];
-    let flips: u64 = ["surface", "sphere", "uv"].iter().filter_map(|map| flips[*map].as_u64()).sum();
+    let flips = report.flips.surface + report.flips.sphere + report.flips.uv;
     format!(
         "{} -> {}: {} vertices, {:.1} evaluations per vertex, {flips} flips, NC {:.4}, max distance {:.2} %, {seconds:.2} s",
         name(&args.field),
         name(&args.output),
-        report["vertices"],
-        report["evaluations"]["per_vertex"].as_f64().unwrap_or(f64::NAN),
-        report["normal_consistency"].as_f64().unwrap_or(f64::NAN),
-        100.0 * report["distance"]["max"].as_f64().unwrap_or(f64::NAN),
+        report.vertices,
+        report.evaluations.per_vertex,
+        report.normal_consistency,
+        100.0 * report.distance.max,
+    )
+}
+
+fn curve_summary(args: &ExtractArgs, svg: &Path, made: &CurveMade, seconds: f64) -> String {
+    let report = &made.report;
+    format!(
+        "{} -> {}, {}: {} samples, {:.1} evaluations per sample, {} self-intersections, max distance {:.2} %, {seconds:.2} s",
+        name(&args.field),
+        name(&args.output),
+        name(svg),
+        report.samples,
+        report.evaluations.total() as f64 / report.samples.max(1) as f64,
+        report.self_intersections,
+        100.0 * report.to_zero_set.max.max(report.from_zero_set.max),
     )
 }

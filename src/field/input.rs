@@ -1,1 +1,226 @@
-//! Not here yet.
+//! From bytes to a [`Field`]: the kind is told by the content, the options are applied or refused, one by one.
+//!
+//! [`describe`] reads a file as [`open`] does and says what it holds, so a bad file is refused when it arrives and not
+//! when a job begins. Formats that are recognised and not read yet are refused by their name.
+
+mod options;
+mod sniff;
+mod wrap;
+
+pub use options::{DomainName, DomainOption, FieldOptions, Rotation, Transform};
+pub use sniff::Format;
+
+use super::grid::Grid;
+use super::mesh::{MeshField, Soundness, TriangleMesh};
+use super::network::{Activation, Network, niq, safetensors};
+use super::scene::Scene;
+use super::{Domain, Field, FieldError, Metric};
+use options::refuse;
+use wrap::{Boxed, Leveled, Transformed};
+
+/// What a file holds.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub enum Description {
+    /// An analytic scene.
+    Scene {
+        /// `json`.
+        format: String,
+        /// 3 for surfaces, 2 for curves.
+        dimension: u8,
+        /// What the values mean.
+        metric: Metric,
+        /// The box that holds the zero level set.
+        domain: Domain,
+    },
+    /// A neural field.
+    Network {
+        /// `safetensors` or `npz`.
+        format: String,
+        /// Outputs of every layer, in order.
+        layers: Vec<u32>,
+        /// Activation of the hidden layers, by name; `mixed` when they differ.
+        activation: String,
+        /// Entries of a latent code; 0 for a network of one shape.
+        latent_size: u32,
+        /// Latent codes that come with the network.
+        latent_rows: u32,
+        /// Weights and biases.
+        parameters: u64,
+        /// What the values mean.
+        metric: Metric,
+        /// The box that holds the zero level set.
+        domain: Domain,
+    },
+    /// A triangle mesh, taken as the exact distance to it.
+    Mesh {
+        /// `ply`, `obj`, `stl`, `off` or `glb`.
+        format: String,
+        /// Vertices, those at one place counted once.
+        vertices: u64,
+        /// Triangles.
+        triangles: u64,
+        /// Smallest and largest coordinates.
+        bounds: Domain,
+        /// Fitness to bound a solid.
+        #[serde(flatten)]
+        soundness: Soundness,
+    },
+    /// A sampled field.
+    Grid {
+        /// `npy`.
+        format: String,
+        /// Samples along each axis.
+        shape: [u32; 3],
+        /// The steepest slope between neighbouring samples, were the grid to span the cube of half extent 1.
+        lipschitz: f32,
+    },
+}
+
+/// Reads a field from the bytes of any known format, with `options` applied.
+///
+/// # Errors
+/// [`FieldError::Invalid`] with a fault per option that does not fit (pointers from the root of the options), otherwise
+/// what the format's reader says.
+pub fn open(bytes: &[u8], options: &FieldOptions) -> Result<Box<dyn Field>, FieldError> {
+    let format = Format::detect(bytes)?;
+    let mut faults = options.faults();
+    match format {
+        Format::Scene => {
+            faults.extend(options.refuse_network_members("a scene"));
+            refuse(faults)?;
+            let on_scene = options.domain.filter(|_| options.transform.is_none());
+            let field = scene_from_slice(bytes, on_scene)?;
+            if field.dimension() == 2 && options.transform.is_some_and(|t| !t.stays_in_plane()) {
+                let detail = "a scene of dimension 2 can only be turned and moved in its plane";
+                refuse(vec![options::fault("/transform", "not_offered", detail)])?;
+            }
+            Ok(finish(field, options, on_scene.is_some()))
+        }
+        Format::Safetensors | Format::Npz => {
+            refuse(std::mem::take(&mut faults))?;
+            let mut network = read_network(bytes, format)?;
+            let latent = options.latent_of(&network, &mut faults);
+            if options.domain == Some(DomainOption::Named(DomainName::Fit)) {
+                faults.push(options::fault("/domain", "not_offered", "a network's domain cannot be fitted"));
+            }
+            refuse(faults)?;
+            if let (Some(activation), Some((_, hidden))) = (options.activation, network.layers.split_last_mut()) {
+                hidden.iter_mut().for_each(|layer| layer.activation = activation);
+            }
+            let field = network
+                .field(&latent)
+                .ok_or_else(|| FieldError::Unsupported { detail: "a latent code that is not finite".to_owned() })?;
+            Ok(finish(Box::new(field), options, false))
+        }
+        Format::Mesh(_) => {
+            faults.extend(options.refuse_network_members("a mesh"));
+            refuse(faults)?;
+            let mut mesh = TriangleMesh::read(bytes)?;
+            if let Some(transform) = &options.transform {
+                transform.apply_to(&mut mesh);
+            }
+            // the transform is in the vertices already, where it costs nothing
+            let rest = FieldOptions { transform: None, ..options.clone() };
+            Ok(finish(Box::new(MeshField::new(mesh)?), &rest, false))
+        }
+        Format::Grid => {
+            faults.extend(options.refuse_network_members("a grid"));
+            let domain = match options.domain {
+                None => Domain::default(),
+                Some(DomainOption::Box(domain)) => domain,
+                Some(DomainOption::Named(DomainName::Fit)) => {
+                    faults.push(options::fault("/domain", "not_offered", "a grid needs the box that its samples span"));
+                    Domain::default()
+                }
+            };
+            refuse(faults)?;
+            Ok(finish(Box::new(Grid::read(bytes, domain)?), options, true))
+        }
+    }
+}
+
+/// Says what the bytes hold, having read and checked them as [`open`] would.
+///
+/// # Errors
+/// As [`open`].
+pub fn describe(bytes: &[u8]) -> Result<Description, FieldError> {
+    let format = Format::detect(bytes)?;
+    let name = format.name().to_owned();
+    Ok(match format {
+        Format::Scene => {
+            let scene = scene_from_slice(bytes, None)?;
+            let (dimension, metric, domain) = (scene.dimension(), scene.metric(), scene.domain());
+            Description::Scene { format: name, dimension, metric, domain }
+        }
+        Format::Safetensors | Format::Npz => {
+            let network = read_network(bytes, format)?;
+            Description::Network {
+                format: name,
+                layers: network.layers.iter().map(|l| l.outputs() as u32).collect(),
+                activation: hidden_activation(&network).to_owned(),
+                latent_size: network.latent_size as u32,
+                latent_rows: network.latent_rows() as u32,
+                parameters: network.parameters() as u64,
+                metric: network.metric,
+                domain: network.domain,
+            }
+        }
+        Format::Mesh(_) => {
+            let mesh = MeshField::new(TriangleMesh::read(bytes)?)?;
+            let (min, max) = mesh.mesh().bounds();
+            Description::Mesh {
+                format: name,
+                vertices: mesh.mesh().vertices.len() as u64,
+                triangles: mesh.mesh().triangles.len() as u64,
+                bounds: Domain { min, max },
+                soundness: *mesh.soundness(),
+            }
+        }
+        Format::Grid => {
+            let grid = Grid::read(bytes, Domain::default())?;
+            let lipschitz = grid.lipschitz().unwrap_or(0.0);
+            Description::Grid { format: name, shape: grid.shape().map(|n| n as u32), lipschitz }
+        }
+    })
+}
+
+fn read_network(bytes: &[u8], format: Format) -> Result<Network, FieldError> {
+    if format == Format::Npz { niq::read(bytes) } else { safetensors::read(bytes) }
+}
+
+fn hidden_activation(network: &Network) -> &'static str {
+    let hidden = &network.layers[..network.layers.len().saturating_sub(1)];
+    let first = hidden.first().map_or(Activation::Identity, |l| l.activation);
+    if hidden.iter().all(|l| l.activation.name() == first.name()) { first.name() } else { "mixed" }
+}
+
+/// Puts transform, level and domain around a field. `placed` says that the domain option was used up on the way.
+fn finish(mut field: Box<dyn Field>, options: &FieldOptions, placed: bool) -> Box<dyn Field> {
+    if let Some(transform) = &options.transform {
+        field = Box::new(Transformed::new(field, transform));
+    }
+    if let Some(level) = options.level.filter(|&l| l != 0.0) {
+        field = Box::new(Leveled::new(field, level));
+    }
+    match options.domain {
+        Some(DomainOption::Box(domain)) if !placed => Box::new(Boxed::new(field, domain)),
+        _ => field,
+    }
+}
+
+/// The scene in the bytes, over the domain that is asked for.
+fn scene_from_slice(bytes: &[u8], domain: Option<DomainOption>) -> Result<Box<dyn Field>, FieldError> {
+    let scene = Scene::from_slice(bytes)?;
+    let domain = match domain {
+        None => scene.domain(),
+        Some(DomainOption::Box(domain)) => domain,
+        Some(DomainOption::Named(DomainName::Fit)) => scene.fit_domain().ok_or_else(|| FieldError::Invalid {
+            faults: vec![options::fault("/domain", "unbounded", "the scene has no bounded solid to fit a domain to")],
+        })?,
+    };
+    Ok(Box::new(scene.with_domain(domain)))
+}
+
+#[cfg(test)]
+mod tests;

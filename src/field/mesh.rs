@@ -112,9 +112,9 @@ impl TriangleMesh {
     pub fn bounds(&self) -> ([f64; 3], [f64; 3]) {
         let mut bounds = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
         for vertex in &self.vertices {
-            for axis in 0..3 {
-                bounds.0[axis] = bounds.0[axis].min(vertex[axis]);
-                bounds.1[axis] = bounds.1[axis].max(vertex[axis]);
+            for (axis, &c) in vertex.iter().enumerate() {
+                bounds.0[axis] = bounds.0[axis].min(c);
+                bounds.1[axis] = bounds.1[axis].max(c);
             }
         }
         bounds

@@ -13,7 +13,7 @@ mod evaluate;
 mod functions;
 pub mod niq;
 pub mod safetensors;
-mod zip;
+pub(in crate::field) mod zip;
 
 pub use activation::Activation;
 pub use evaluate::NetworkField;

@@ -198,7 +198,7 @@ impl<'a> Sampler<'a> {
 
 /// The field cut off at its box: inside, the larger of the field and the (negative) distance to the box; outside, the
 /// distance to the box on top of what the field is at the nearest point of the box. Continuous, and positive outside.
-fn close_at_box(p: DVec3, lo: DVec3, hi: DVec3, flat: bool, value: f64, gradient: DVec3) -> (f64, DVec3) {
+pub(super) fn close_at_box(p: DVec3, lo: DVec3, hi: DVec3, flat: bool, value: f64, gradient: DVec3) -> (f64, DVec3) {
     let beyond = p - p.clamp(lo, hi);
     let distance = beyond.length();
     if distance > 0.0 {

@@ -2,6 +2,7 @@
 
 use super::{App, Problem, body, query};
 use crate::blobs::BlobId;
+use crate::field::input::Description;
 use crate::job::{Failure, pipeline};
 use axum::Json;
 use axum::body::Body;
@@ -23,8 +24,7 @@ pub struct Input {
     #[schema(value_type = String, format = DateTime)]
     created_at: Timestamp,
     /// What it is: its kind, and what was found in it.
-    #[schema(value_type = Object)]
-    description: serde_json::Value,
+    description: Description,
 }
 
 /// Uploads an input

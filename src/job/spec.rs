@@ -4,7 +4,8 @@
 //! with a JSON Pointer; unknown members are refused by name. The scene itself is checked by its own room.
 
 use crate::blobs::BlobId;
-use crate::field::Fault;
+use crate::field::input::FieldOptions;
+use crate::field::{Fault, FieldError};
 use crate::shrink::lattice::LatticeSpec;
 use crate::shrink::{Method, ShrinkSpec};
 use serde::{Deserialize, Serialize};
@@ -91,22 +92,9 @@ pub struct FieldSpec {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>)]
     pub input: Option<BlobId>,
-    /// The latent code of an auto-decoder.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub latent: Option<Vec<f32>>,
-    /// The row of the input's own table of latent codes.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub latent_row: Option<u32>,
-    /// The box that holds the zero level set, `{"min": [x, y, z], "max": [x, y, z]}`, or `"fit"`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    #[schema(value_type = Option<Object>)]
-    pub domain: Option<Value>,
-    /// The level that is taken as zero.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub level: Option<f32>,
-    /// The activation, where the file does not say it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub activation: Option<String>,
+    /// What to do with the field: latent code, transform, domain, level, activation.
+    #[serde(flatten)]
+    pub options: FieldOptions,
 }
 
 /// A checked request for a job.
@@ -243,7 +231,7 @@ fn read_spec(value: &Value, faults: &mut Faults) -> JobSpec {
 
 fn read_field(value: &Value, faults: &mut Faults) -> FieldSpec {
     let mut field = FieldSpec::default();
-    let known = ["scene", "input", "latent", "latent_row", "domain", "level", "activation"];
+    let known = ["scene", "input", "latent", "latent_row", "transform", "domain", "level", "activation"];
     let Some(object) = faults.object(value, "/field", &known) else { return field };
     match (object.get("scene"), object.get("input")) {
         (Some(scene), None) => field.scene = Some(scene.clone()),
@@ -259,23 +247,36 @@ fn read_field(value: &Value, faults: &mut Faults) -> FieldSpec {
         (Some(_), Some(_)) => faults.add("/field", "ambiguous", "give scene or input, not both"),
         (None, None) => faults.add("/field", "missing_member", "give scene or input"),
     }
-    if let Some(latent) = object.get("latent") {
-        field.latent = read_latent(latent, faults);
-        if object.contains_key("latent_row") {
-            faults.add("/field/latent_row", "ambiguous", "give latent or latent_row, not both");
-        }
-    }
-    field.latent_row = object.get("latent_row").and_then(|row| faults.count(row, "/field/latent_row"));
-    field.level = object.get("level").and_then(|level| faults.number(level, "/field/level"));
-    field.activation = object
-        .get("activation")
-        .and_then(|activation| faults.string(activation, "/field/activation"))
-        .map(str::to_owned);
-    if let Some(domain) = object.get("domain") {
-        check_domain(domain, faults);
-        field.domain = Some(domain.clone());
+    field.options = FieldOptions {
+        latent: object.get("latent").and_then(|latent| read_latent(latent, faults)),
+        latent_row: object.get("latent_row").and_then(|row| faults.count(row, "/field/latent_row")),
+        transform: option(object, "transform", "scale, rotate {axis [3], angle}, translate [3]", faults),
+        domain: option(object, "domain", "\"fit\" or {\"min\": [x, y, z], \"max\": [x, y, z]}", faults),
+        level: object.get("level").and_then(|level| faults.number(level, "/field/level")),
+        activation: option(object, "activation", "the name of an activation", faults),
+    };
+    // what an option may be is known in the field's room
+    if let Err(FieldError::Invalid { faults: wrong }) = field.options.check() {
+        faults.0.extend(wrong.into_iter().map(|f| Fault { pointer: format!("/field{}", f.pointer), ..f }));
     }
     field
+}
+
+/// A member that its own type reads.
+fn option<T: serde::de::DeserializeOwned>(
+    object: &Map<String, Value>,
+    name: &str,
+    expected: &str,
+    faults: &mut Faults,
+) -> Option<T> {
+    let value = object.get(name)?;
+    match T::deserialize(value) {
+        Ok(read) => Some(read),
+        Err(error) => {
+            faults.add(format!("/field/{name}"), "invalid_value", format!("expected {expected}: {error}"));
+            None
+        }
+    }
 }
 
 fn read_latent(value: &Value, faults: &mut Faults) -> Option<Vec<f32>> {
@@ -291,29 +292,6 @@ fn read_latent(value: &Value, faults: &mut Faults) -> Option<Vec<f32>> {
     // a plain collect would stop at the first fault
     let numbers: Vec<Option<f32>> = numbers.collect();
     numbers.into_iter().collect()
-}
-
-fn check_domain(value: &Value, faults: &mut Faults) {
-    if value == "fit" {
-        return;
-    }
-    let Some(object) = faults.object(value, "/field/domain", &["min", "max"]) else { return };
-    let mut corners = [[0.0f32; 3]; 2];
-    for (corner, name) in corners.iter_mut().zip(["min", "max"]) {
-        let pointer = format!("/field/domain/{name}");
-        match object.get(name).map(|v| v.as_array().map(Vec::as_slice)) {
-            Some(Some(list)) if list.len() == 3 => {
-                for (axis, coordinate) in list.iter().enumerate() {
-                    corner[axis] = faults.number(coordinate, &format!("{pointer}/{axis}")).unwrap_or(f32::NAN);
-                }
-            }
-            Some(_) => faults.add(pointer, "wrong_type", "expected three numbers"),
-            None => faults.add(pointer, "missing_member", "a domain has min and max"),
-        }
-    }
-    if (0..3).any(|axis| corners[0][axis] >= corners[1][axis]) {
-        faults.add("/field/domain", "empty_domain", "every coordinate of min must be below that of max");
-    }
 }
 
 fn read_shrink(value: &Value, faults: &mut Faults) -> ShrinkSpec {
@@ -500,7 +478,10 @@ mod tests {
         assert_eq!(faults(json!({"field": {}})), [("/field".to_owned(), "missing_member")]);
         assert_eq!(faults(json!({"field": {"scene": {}, "input": "x"}})), [("/field".to_owned(), "ambiguous")]);
         let empty = json!({"field": {"scene": {}, "domain": {"min": [0, 0, 0], "max": [1, 0, 1]}}});
-        assert_eq!(faults(empty), [("/field/domain".to_owned(), "empty_domain")]);
+        assert_eq!(faults(empty), [("/field/domain/max/1".to_owned(), "empty")]);
+        let odd = json!({"field": {"scene": {}, "domain": "large", "activation": "magic", "transform": {"scael": 2}}});
+        let places = ["/field/transform", "/field/domain", "/field/activation"];
+        assert_eq!(faults(odd), places.map(|p| (p.to_owned(), "invalid_value")));
     }
 
     #[test]

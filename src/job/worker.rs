@@ -102,7 +102,8 @@ impl Worker {
         let mut work = tokio::spawn(self.work(claim.clone(), cancel.clone(), news).in_current_span());
         let interrupted = self.engine.interrupted(&claim);
         tokio::pin!(interrupted);
-        let mut heartbeat = tokio::time::interval(claim.lease / 3);
+        let beat = claim.lease / 3;
+        let mut heartbeat = tokio::time::interval_at(tokio::time::Instant::now() + beat, beat);
         let (mut lost, mut watching, mut returning) = (false, true, false);
         let result = loop {
             tokio::select! {
@@ -186,13 +187,13 @@ impl Worker {
             let span = tracing::Span::current();
             let compute = move || {
                 let _entered = span.enter();
-                let field = pipeline::open(&claim.spec.field, input.as_deref())?;
+                let opened = pipeline::open(&claim.spec.field, input.as_deref(), "/field")?;
                 cancel.check()?;
                 let teller = Teller::new(news);
                 let progress = |progress: Progress| teller.tell(progress);
                 let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress };
                 let load = clock.elapsed().as_secs_f64();
-                pipeline::make(field.as_ref(), &claim.spec.shrink, &claim.spec.outputs, load, settings)
+                pipeline::make(&opened, &claim.spec.shrink, &claim.spec.outputs, load, settings)
             };
             tokio::task::spawn_blocking(compute).await.unwrap_or_else(|panic| {
                 tracing::error!(%panic, "the computation panicked");
@@ -220,7 +221,8 @@ impl Worker {
                 }
             }
         }
-        Outcome::Succeeded { outputs, metrics: made.report }
+        let metrics = serde_json::to_value(&made.report).unwrap_or_default();
+        Outcome::Succeeded { outputs, metrics }
     }
 
     async fn end(&self, claim: &Claim, outcome: Outcome) {

@@ -204,13 +204,8 @@ impl MeshField {
         let normal = self.pseudo_normal(triangle, nearest.feature);
         let side = away.dot(normal);
         let decided = side.abs() > UNDECIDED * distance * normal.length();
-        let inside = if distance <= self.on_surface {
-            side < 0.0
-        } else if self.soundness.bounds_a_solid() && decided {
-            side < 0.0
-        } else {
-            self.wrapped(p)
-        };
+        let told_by_normal = distance <= self.on_surface || self.soundness.bounds_a_solid() && decided;
+        let inside = if told_by_normal { side < 0.0 } else { self.wrapped(p) };
         let sign = if inside { -1.0 } else { 1.0 };
         let gradient = if distance > self.on_surface {
             away * (sign / distance)

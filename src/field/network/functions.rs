@@ -21,7 +21,7 @@ pub(super) fn exp(x: f32) -> f32 {
     p = p * r + 8.333_452e-3;
     p = p * r + 4.166_579_6e-2;
     p = p * r + 1.666_666_5e-1;
-    p = p * r + 5.000_000_1e-1;
+    p = p * r + 0.5;
     let e = p * (r * r) + r + 1.0;
     // shifted holds n in its low bits; moved into the exponent it is a factor of 2^n
     f32::from_bits(e.to_bits().wrapping_add(shifted.to_bits() << 23))
@@ -56,7 +56,7 @@ pub(super) fn tanh(x: f32) -> f32 {
     let x2 = x * x;
     // the minimax polynomial of Cephes' tanhf for |x| < 0.625
     let mut p = -5.704_988_7e-3;
-    p = p * x2 + 2.063_908_9e-2;
+    p = p * x2 + 2.063_909e-2;
     p = p * x2 - 5.373_971_6e-2;
     p = p * x2 + 1.333_144_2e-1;
     p = p * x2 - 3.333_328e-1;

@@ -126,7 +126,7 @@ pub fn read(bytes: &[u8]) -> Result<Network, FieldError> {
         layers.push(Layer { weights, bias, activation: spec.activation, skip: spec.skip });
     }
     let latent_size = architecture.latent_size as usize;
-    let latent_codes = if tensors.names().iter().any(|n| *n == "latent_codes") {
+    let latent_codes = if tensors.names().contains(&"latent_codes") {
         let (shape, codes) = take("latent_codes".to_owned(), 2)?;
         if shape[1] != latent_size {
             return Err(fault(
