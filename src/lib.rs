@@ -1,8 +1,15 @@
 //! `shrinkd` turns a signed distance field into a parameterized surface: it contracts a sphere onto the zero level set and
 //! keeps the sphere's coordinates as UVs.
 
+pub mod blobs;
+pub mod cli;
+pub mod config;
+pub mod engine;
 pub mod field;
+pub mod http;
+pub mod job;
 pub mod measure;
 pub mod settings;
 pub mod shrink;
 pub mod surface;
+pub mod telemetry;

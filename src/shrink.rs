@@ -4,9 +4,27 @@
 //! resampling; `method: paper` is the literal loop of the paper, the baseline. Both end in a [`Wrap`]: one position per
 //! vertex of a [`SphereLattice`](lattice::SphereLattice).
 
+mod adaptive;
+mod base;
+mod contract;
+mod creases;
+pub mod curve;
+mod density;
+mod energy;
+mod grid3;
 pub mod lattice;
+mod locate;
+mod paper;
+mod remesh;
+mod resample;
+mod rings;
+mod sphere_map;
+mod topology;
+mod unfold;
+mod untangle;
+mod zero;
 
-use crate::field::{Frame, Sampler};
+use crate::field::Sampler;
 use crate::settings::Canceled;
 use glam::DVec3;
 use lattice::{LatticeSpec, SphereLattice};
@@ -73,6 +91,9 @@ pub enum ShrinkError {
         /// Scene positions on the handles that were found; at most 16.
         places: Vec<[f64; 3]>,
     },
+    /// The base surface could not be mapped to the sphere.
+    #[error("the surface could not be mapped to the sphere without folding")]
+    Unmapped,
     /// The field's dimension does not fit what is asked.
     #[error("the field is {found}-dimensional, and this needs one of dimension {wanted}")]
     Dimension {
@@ -88,19 +109,11 @@ pub enum ShrinkError {
 /// # Errors
 /// [`ShrinkError`] when the run was canceled, or when the zero level set is empty, in several pieces or has handles.
 pub fn shrink(sampler: &Sampler<'_>, spec: &ShrinkSpec) -> Result<Wrap, ShrinkError> {
-    let lattice = SphereLattice::new(spec.lattice);
-    let domain = sampler.domain();
-    let (lo, hi) = (DVec3::from(domain.min), DVec3::from(domain.max));
-    let frame = Frame { center: 0.5 * (lo + hi), scale: 0.5 * (hi - lo).max_element() };
-    let framed = sampler.framed(frame);
-    sampler.tally().stage("shrink");
-    let mut q: Vec<DVec3> = lattice.directions.clone();
-    for _ in 0..60 {
-        let (s, g) = framed.gradients(&q)?;
-        for i in 0..q.len() {
-            q[i] -= 0.3 * s[i] * g[i].normalize_or_zero();
-        }
+    if sampler.field().dimension() != 3 {
+        return Err(ShrinkError::Dimension { found: sampler.field().dimension(), wanted: 3 });
     }
-    let diagonals = vec![false; lattice.quads.len()];
-    Ok(Wrap { positions: q.into_iter().map(|q| frame.to_scene(q)).collect(), diagonals, lattice })
+    match spec.method {
+        Method::Adaptive => adaptive::run(sampler, spec),
+        Method::Paper => paper::run(sampler, spec),
+    }
 }

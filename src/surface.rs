@@ -1,9 +1,11 @@
 //! The result: positions on a lattice, normals from the field, UVs from the sphere.
 
+pub mod checkerboard;
 pub mod curve;
 pub mod forms;
 pub mod gltf;
 pub mod preview;
+pub mod raster;
 pub mod tensors;
 
 use crate::field::Sampler;

@@ -13,6 +13,7 @@ pub use sniff::Format;
 use super::grid::Grid;
 use super::mesh::{MeshField, Soundness, TriangleMesh};
 use super::network::{Activation, Network, niq, safetensors};
+use super::scene::Scene;
 use super::{Domain, Field, FieldError, Metric};
 use options::refuse;
 use wrap::{Boxed, Leveled, Transformed};
@@ -209,8 +210,16 @@ fn finish(mut field: Box<dyn Field>, options: &FieldOptions, placed: bool) -> Bo
 }
 
 /// The scene in the bytes, over the domain that is asked for.
-fn scene_from_slice(_bytes: &[u8], _domain: Option<DomainOption>) -> Result<Box<dyn Field>, FieldError> {
-    Err(FieldError::Unsupported { detail: "scenes".to_owned() })
+fn scene_from_slice(bytes: &[u8], domain: Option<DomainOption>) -> Result<Box<dyn Field>, FieldError> {
+    let scene = Scene::from_slice(bytes)?;
+    let domain = match domain {
+        None => scene.domain(),
+        Some(DomainOption::Box(domain)) => domain,
+        Some(DomainOption::Named(DomainName::Fit)) => scene.fit_domain().ok_or_else(|| FieldError::Invalid {
+            faults: vec![options::fault("/domain", "unbounded", "the scene has no bounded solid to fit a domain to")],
+        })?,
+    };
+    Ok(Box::new(scene.with_domain(domain)))
 }
 
 #[cfg(test)]

@@ -1,1 +1,305 @@
-//! (to be written)
+//! Distances between a surface and its truth, both ways, with no sampling floor: from samples of one to the closest point
+//! of the other. The truth is a mesh where there is one, otherwise the zero level set of the field itself.
+
+use super::certificate::positions;
+use super::nearest::Nearest;
+use super::report::{Distance, OneWay};
+use super::sampling::{Samples, by_area};
+use super::{corners, diagonal, doubled_normal, zero_set};
+use crate::field::mesh::TriangleMesh;
+use crate::field::{Metric, Sampler};
+use crate::settings::{Canceled, Settings};
+use crate::surface::Surface;
+use glam::DVec3;
+
+/// Samples of each surface when the truth is a mesh.
+pub const SAMPLES: usize = 100_000;
+/// Samples of the surface when the truth is a field: each costs several evaluations, of a network perhaps.
+pub const FIELD_SAMPLES: usize = 20_000;
+/// Seeds of the samples of the surface and of the truth: any two that differ.
+const SEEDS: [u64; 2] = [1, 2];
+/// How far from the surface the field's zero set is looked for along the gradient, in parts of the diagonal. Beyond, the
+/// nearest point that the grid found counts.
+const REACH: f64 = 0.05;
+
+/// A mesh by reference: positions in scene units, and triangles.
+#[derive(Clone, Copy, Debug)]
+pub struct Mesh<'a> {
+    /// Positions.
+    pub vertices: &'a [DVec3],
+    /// Triangles, counter-clockwise outward.
+    pub triangles: &'a [[u32; 3]],
+}
+
+/// Distances and normal consistency, both ways.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Comparison {
+    /// Distances, in parts of the truth's diagonal.
+    pub distance: Distance,
+    /// Mean over both directions of the mean |n . n'|.
+    pub normal_consistency: f64,
+    /// The same with the sign: n . n'.
+    pub normal_consistency_signed: f64,
+}
+
+/// Distances and cosines of normals from samples of one side, weighted.
+#[derive(Default)]
+struct Tallied {
+    weight: f64,
+    sum: f64,
+    squares: f64,
+    max: f64,
+    cosine: f64,
+    cosine_absolute: f64,
+}
+
+impl Tallied {
+    fn add(&mut self, weight: f64, distance: f64, cosine: f64) {
+        self.weight += weight;
+        self.sum += weight * distance;
+        self.squares += weight * distance * distance;
+        self.max = self.max.max(distance);
+        self.cosine += weight * cosine;
+        self.cosine_absolute += weight * cosine.abs();
+    }
+    fn one_way(&self, diagonal: f64) -> OneWay {
+        let n = self.weight.max(f64::MIN_POSITIVE);
+        OneWay {
+            mean: self.sum / n / diagonal,
+            rms: (self.squares / n).sqrt() / diagonal,
+            max: self.max / diagonal,
+            normal_consistency: self.cosine_absolute / n,
+            normal_consistency_signed: self.cosine / n,
+        }
+    }
+}
+
+fn both(surface_to_truth: OneWay, truth_to_surface: OneWay) -> Comparison {
+    let (a, b) = (surface_to_truth, truth_to_surface);
+    Comparison {
+        distance: Distance {
+            mean: 0.5 * (a.mean + b.mean),
+            rms: (0.5 * (a.rms * a.rms + b.rms * b.rms)).sqrt(),
+            max: a.max.max(b.max),
+            surface_to_truth,
+            truth_to_surface,
+        },
+        normal_consistency: 0.5 * (a.normal_consistency + b.normal_consistency),
+        normal_consistency_signed: 0.5 * (a.normal_consistency_signed + b.normal_consistency_signed),
+    }
+}
+
+fn unit_normals(mesh: Mesh<'_>) -> Vec<DVec3> {
+    mesh.triangles.iter().map(|&t| doubled_normal(corners(mesh.vertices, t)).normalize_or_zero()).collect()
+}
+
+/// Compares a surface with a mesh: `samples` points of each, uniform by area, for means and normals, and every vertex of
+/// both besides for the maximum. `None` when either has no area.
+///
+/// # Errors
+/// When the token is raised.
+pub fn between(
+    surface: Mesh<'_>,
+    truth: Mesh<'_>,
+    samples: usize,
+    settings: &Settings<'_>,
+) -> Result<Option<Comparison>, Canceled> {
+    let on_surface = by_area(surface.vertices, surface.triangles, samples, SEEDS[0]);
+    let on_truth = by_area(truth.vertices, truth.triangles, samples, SEEDS[1]);
+    if on_surface.points.is_empty() || on_truth.points.is_empty() {
+        return Ok(None);
+    }
+    let size = diagonal(truth.vertices);
+    let there = one_way(surface, &on_surface, truth, settings)?.one_way(size);
+    let back = one_way(truth, &on_truth, surface, settings)?.one_way(size);
+    Ok(Some(both(there, back)))
+}
+
+fn one_way(from: Mesh<'_>, samples: &Samples, to: Mesh<'_>, settings: &Settings<'_>) -> Result<Tallied, Canceled> {
+    let nearest = Nearest::new(to.vertices, to.triangles);
+    let (from_normals, to_normals) = (unit_normals(from), unit_normals(to));
+    let mut tallied = Tallied::default();
+    for (hit, &t) in nearest.closest_all(&samples.points, settings)?.iter().zip(&samples.triangles) {
+        tallied.add(1.0, hit.distance(), from_normals[t as usize].dot(to_normals[hit.triangle as usize]));
+    }
+    for hit in nearest.closest_all(from.vertices, settings)? {
+        tallied.max = tallied.max.max(hit.distance());
+    }
+    Ok(tallied)
+}
+
+/// Compares a surface with the field behind `sampler`.
+///
+/// There: from every sample of the surface (and, for the maximum, every vertex) to the zero level set: |s| where the field is
+/// an exact distance, otherwise the smaller of the way along the gradient and the distance to the nearest point of
+/// [`zero_set::find`]. Back: from the points of [`zero_set::find`] over the whole domain to the closest point of the
+/// surface, weighted by the area that they stand for. Normals are the field's gradients on the zero set. `None` when the
+/// surface has no area or no zero was found.
+///
+/// # Errors
+/// When the token is raised.
+pub fn to_field(surface: Mesh<'_>, samples: usize, sampler: &Sampler<'_>) -> Result<Option<Comparison>, Canceled> {
+    let settings = sampler.settings();
+    let on_surface = by_area(surface.vertices, surface.triangles, samples, SEEDS[0]);
+    let zeros = zero_set::find(sampler)?;
+    if on_surface.points.is_empty() || zeros.points.is_empty() {
+        return Ok(None);
+    }
+    let size = diagonal(&zeros.points);
+    let normals = unit_normals(surface);
+
+    let mut starts = on_surface.points.clone();
+    starts.extend_from_slice(surface.vertices);
+    let landed = land(&starts, &zeros, REACH * size, sampler)?;
+    let mut there = Tallied::default();
+    for (i, (distance, normal)) in landed.iter().enumerate() {
+        match on_surface.triangles.get(i) {
+            Some(&t) => there.add(1.0, *distance, normals[t as usize].dot(*normal)),
+            None => there.max = there.max.max(*distance),
+        }
+    }
+    let nearest = Nearest::new(surface.vertices, surface.triangles);
+    let mut back = Tallied::default();
+    for (i, hit) in nearest.closest_all(&zeros.points, settings)?.iter().enumerate() {
+        back.add(zeros.weights[i], hit.distance(), normals[hit.triangle as usize].dot(zeros.normals[i]));
+    }
+    Ok(Some(both(there.one_way(size), back.one_way(size))))
+}
+
+/// Distance from every start to the zero set, and the unit gradient where it lands.
+fn land(
+    starts: &[DVec3],
+    zeros: &zero_set::ZeroSet,
+    reach: f64,
+    sampler: &Sampler<'_>,
+) -> Result<Vec<(f64, DVec3)>, Canceled> {
+    if sampler.field().metric() == Metric::Exact {
+        // the gradient is the same all along the way to the closest point
+        let (values, gradients) = sampler.gradients(starts)?;
+        return Ok(values.iter().zip(&gradients).map(|(s, g)| (s.abs(), g.normalize_or_zero())).collect());
+    }
+    let traced = zero_set::trace(starts, reach, sampler)?;
+    let nearby = Nearest::of_points(&zeros.points).closest_all(starts, sampler.settings())?;
+    let ends: Vec<DVec3> = (0..starts.len())
+        .map(|i| match traced[i] {
+            Some(end) if end.distance_squared(starts[i]) <= nearby[i].distance_squared => end,
+            _ => nearby[i].point,
+        })
+        .collect();
+    let (_, gradients) = sampler.gradients(&ends)?;
+    Ok((0..starts.len()).map(|i| (ends[i].distance(starts[i]), gradients[i].normalize_or_zero())).collect())
+}
+
+/// A truth mesh's positions.
+pub fn mesh_vertices(mesh: &TriangleMesh) -> Vec<DVec3> {
+    mesh.vertices.iter().map(|&p| DVec3::from(p)).collect()
+}
+
+/// Compares a surface with what it was made from: the field's own mesh where it has one, otherwise the field.
+///
+/// # Errors
+/// When the token is raised.
+pub fn to_truth(surface: &Surface, sampler: &Sampler<'_>) -> Result<Option<Comparison>, Canceled> {
+    let vertices = positions(surface);
+    let mesh = Mesh { vertices: &vertices, triangles: &surface.triangles };
+    match sampler.field().truth() {
+        Some(truth) => {
+            let truth_vertices = mesh_vertices(truth);
+            let truth = Mesh { vertices: &truth_vertices, triangles: &truth.triangles };
+            between(mesh, truth, SAMPLES, sampler.settings())
+        }
+        None => to_field(mesh, FIELD_SAMPLES, sampler),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::fixtures::*;
+    use super::*;
+    use crate::field::Field;
+    use crate::field::sampler::Tally;
+    use glam::Vec3;
+
+    /// Diagonal of the bounding box of the unit sphere.
+    const UNIT: f64 = 2.0 * 1.732_050_807_568_877_2;
+
+    #[test]
+    fn concentric_spheres_are_apart_by_the_difference_of_their_radii() {
+        let (inner, triangles) = sphere_mesh(120, 60, 0.9, DVec3::ZERO);
+        let (outer, _) = sphere_mesh(120, 60, 1.0, DVec3::ZERO);
+        let (a, b) =
+            (Mesh { vertices: &inner, triangles: &triangles }, Mesh { vertices: &outer, triangles: &triangles });
+        let c = with_settings(2, |s| between(a, b, 5000, s).unwrap().unwrap());
+        for way in [c.distance.surface_to_truth, c.distance.truth_to_surface] {
+            assert!((way.mean * UNIT - 0.1).abs() < 1e-3, "{c:?}");
+            assert!((way.rms - way.mean).abs() < 1e-3);
+        }
+        assert!((c.distance.max * UNIT - 0.1).abs() < 1e-3);
+        assert!(c.normal_consistency > 0.999 && c.normal_consistency_signed > 0.999);
+    }
+
+    #[test]
+    fn a_surface_against_itself_is_at_distance_zero_whatever_the_samples() {
+        let (vertices, triangles) = sphere_mesh(40, 20, 1.0, DVec3::ZERO);
+        let mesh = Mesh { vertices: &vertices, triangles: &triangles };
+        let c = with_settings(1, |s| between(mesh, mesh, 5000, s).unwrap().unwrap());
+        assert!(c.distance.max < 1e-15, "{c:?}");
+        assert!(c.normal_consistency > 0.9999);
+    }
+
+    #[test]
+    fn an_inside_out_surface_is_seen_by_the_signed_normals_only() {
+        let (vertices, triangles) = sphere_mesh(40, 20, 1.0, DVec3::ZERO);
+        let turned: Vec<[u32; 3]> = triangles.iter().map(|&[a, b, c]| [a, c, b]).collect();
+        let (a, b) =
+            (Mesh { vertices: &vertices, triangles: &turned }, Mesh { vertices: &vertices, triangles: &triangles });
+        let c = with_settings(1, |s| between(a, b, 1000, s).unwrap().unwrap());
+        assert!(c.normal_consistency > 0.9999 && c.normal_consistency_signed < -0.9999);
+    }
+
+    #[test]
+    fn a_part_that_the_surface_misses_shows_in_one_direction() {
+        let (vertices, triangles) = sphere_mesh(60, 30, 1.0, DVec3::ZERO);
+        let (more, _) = sphere_mesh(60, 30, 0.1, DVec3::X * 2.0);
+        let all: Vec<DVec3> = vertices.iter().chain(&more).copied().collect();
+        let n = vertices.len() as u32;
+        let both: Vec<[u32; 3]> = triangles.iter().copied().chain(triangles.iter().map(|t| t.map(|v| v + n))).collect();
+        let (a, b) = (Mesh { vertices: &vertices, triangles: &triangles }, Mesh { vertices: &all, triangles: &both });
+        let c = with_settings(1, |s| between(a, b, 1000, s).unwrap().unwrap()).distance;
+        assert!(c.surface_to_truth.max < 1e-15);
+        let size = DVec3::new(3.1, 2.0, 2.0).length();
+        assert!((c.truth_to_surface.max * size - 1.1).abs() < 1e-3, "{c:?}");
+    }
+
+    fn against_field(field: &dyn Field, radius: f64) -> Comparison {
+        let (vertices, triangles) = sphere_mesh(120, 60, radius, DVec3::ZERO);
+        let mesh = Mesh { vertices: &vertices, triangles: &triangles };
+        with_settings(2, |s| to_field(mesh, 5000, &Sampler::new(field, *s, &Tally::new())).unwrap().unwrap())
+    }
+
+    #[test]
+    fn distances_to_a_field_do_not_depend_on_what_its_values_mean() {
+        for (slope, metric) in [(1.0, Metric::Exact), (200.0, Metric::Sign), (0.1, Metric::Bound)] {
+            let field = Balls { slope, metric, ..Balls::one(0.5) };
+            let size = 0.5 * UNIT;
+            let c = against_field(&field, 0.52);
+            for way in [c.distance.surface_to_truth, c.distance.truth_to_surface] {
+                assert!((way.mean * size - 0.02).abs() < 5e-4, "{metric:?} {c:?}");
+                assert!((way.max * size - 0.02).abs() < 5e-4, "{metric:?} {c:?}");
+            }
+            assert!(c.normal_consistency_signed > 0.999, "{c:?}");
+            // too far to be traced: the grid's own points answer
+            let c = against_field(&field, 0.7);
+            assert!((c.distance.surface_to_truth.mean * size - 0.2).abs() < 1e-3, "{metric:?} {c:?}");
+        }
+    }
+
+    #[test]
+    fn a_floater_that_was_not_wrapped_counts() {
+        let field = Balls { balls: vec![(Vec3::ZERO, 0.5), (Vec3::X * 0.9, 0.05)], slope: 1.0, metric: Metric::Bound };
+        let c = against_field(&field, 0.5);
+        let size = DVec3::new(1.45, 1.0, 1.0).length();
+        assert!((c.distance.truth_to_surface.max * size - 0.45).abs() < 2e-3, "{c:?}");
+        assert!(c.distance.surface_to_truth.max < 1e-3);
+    }
+}

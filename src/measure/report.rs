@@ -1,9 +1,19 @@
-//! The report: every figure of a result, measured.
+//! The report: every figure of a result, measured. Definitions are in `docs/metrics.md`.
 
-use crate::field::Counts;
+use super::certificate::certify;
+use super::distance::to_truth;
+use super::distortion::distortions;
+use crate::field::sampler::Tally;
+use crate::field::{Counts, Sampler};
+use crate::settings::Canceled;
 use crate::shrink::Method;
+use crate::shrink::ShrinkSpec;
 use crate::shrink::lattice::LatticeSpec;
+use crate::surface::Surface;
 use std::collections::BTreeMap;
+
+/// Largest distance, in parts of the truth's diagonal, at which a shape still succeeds.
+pub const MAX_DISTANCE: f64 = 0.01;
 
 /// Everything measured about one result; the same object in `report.json`, over HTTP and in the GLB's extras.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
@@ -22,12 +32,16 @@ pub struct Report {
     pub charts: u64,
     /// Folded triangles: on the surface (normal against the field's gradient), on the sphere, in the chart.
     pub flips: Flips,
-    /// Pairs of triangles that intersect and share no vertex.
+    /// Pairs of triangles that meet in more than the vertices or the edge they share, by exact predicates.
     pub self_intersections: u64,
+    /// Triangles of exactly no area.
+    pub degenerate: u64,
     /// Distances between surface and truth, in parts of the truth's bounding-box diagonal, both ways.
     pub distance: Distance,
     /// Mean of |n . n'| over both directions, face normals.
     pub normal_consistency: f64,
+    /// Mean of n . n' over both directions, face normals.
+    pub normal_consistency_signed: f64,
     /// Distortion of the parameterization.
     pub distortion: Distortions,
     /// Wall-clock seconds by part of the job; filled in by the caller, who has a clock.
@@ -42,6 +56,79 @@ pub struct Report {
     pub version: String,
 }
 
+/// Measures a surface against the field behind `sampler`. `spent` are the evaluations that made the surface, by stage;
+/// those that measuring takes are counted into a tally of its own and forgotten. `seconds` are left at 0 for the caller,
+/// who has a clock.
+///
+/// A surface or a field without any zero to compare has a distance of 1 (the whole diagonal) and consistency 0.
+///
+/// # Errors
+/// When the token is raised.
+pub fn measure(
+    surface: &Surface,
+    sampler: &Sampler<'_>,
+    spent: &BTreeMap<&'static str, Counts>,
+    spec: &ShrinkSpec,
+) -> Result<Report, Canceled> {
+    let own = Tally::new();
+    let sampler = Sampler::new(sampler.field(), *sampler.settings(), &own);
+    let certificate = certify(surface, &sampler)?;
+    let comparison = to_truth(surface, &sampler)?.unwrap_or_else(|| super::distance::Comparison {
+        distance: Distance { mean: 1.0, rms: 1.0, max: 1.0, ..Distance::default() },
+        ..Default::default()
+    });
+    let vertices = surface.positions.len() as u64;
+    Ok(Report {
+        vertices,
+        triangles: surface.triangles.len() as u64,
+        evaluations: Evaluations::new(spent, vertices),
+        closed: certificate.topology.closed,
+        euler: certificate.topology.euler,
+        charts: certificate.charts,
+        flips: certificate.flips,
+        self_intersections: certificate.self_intersections,
+        degenerate: certificate.degenerate,
+        distance: comparison.distance,
+        normal_consistency: comparison.normal_consistency,
+        normal_consistency_signed: comparison.normal_consistency_signed,
+        distortion: distortions(surface),
+        seconds: Seconds::default(),
+        threads: sampler.settings().pool.current_num_threads() as u64,
+        method: spec.method,
+        lattice: spec.lattice,
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+    })
+}
+
+/// Whether a result succeeds: closed, Euler 2, one chart, no flip of any kind, no self-intersection, and nowhere farther than
+/// [`MAX_DISTANCE`] of the diagonal from the truth, both ways.
+///
+/// # Errors
+/// One sentence for every condition that does not hold.
+pub fn passes(report: &Report) -> Result<(), Vec<String>> {
+    let mut faults = Vec::new();
+    let mut demand = |holds: bool, fault: String| {
+        if !holds {
+            faults.push(fault);
+        }
+    };
+    demand(report.closed, "the surface is not closed".to_owned());
+    demand(report.euler == 2, format!("the Euler number is {} instead of 2", report.euler));
+    demand(report.charts == 1, format!("there are {} charts instead of 1", report.charts));
+    let Flips { surface, sphere, uv } = report.flips;
+    demand(surface == 0, format!("{surface} triangles are folded over on the surface"));
+    demand(sphere == 0, format!("{sphere} triangles are turned over on the sphere"));
+    demand(uv == 0, format!("{uv} triangles are turned over in the chart"));
+    let crossing = report.self_intersections;
+    demand(crossing == 0, format!("{crossing} pairs of triangles intersect"));
+    let max = report.distance.max;
+    demand(
+        max <= MAX_DISTANCE,
+        format!("the largest distance is {:.3} % of the diagonal, over {} %", 100.0 * max, 100.0 * MAX_DISTANCE),
+    );
+    if faults.is_empty() { Ok(()) } else { Err(faults) }
+}
+
 /// Field evaluations.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
 pub struct Evaluations {
@@ -53,6 +140,19 @@ pub struct Evaluations {
     pub per_vertex: f64,
     /// By stage.
     pub by_stage: BTreeMap<String, Counts>,
+}
+
+impl Evaluations {
+    /// Sums what was spent by stage.
+    pub fn new(spent: &BTreeMap<&'static str, Counts>, vertices: u64) -> Self {
+        let (value, gradient) = spent.values().fold((0, 0), |sum, c| (sum.0 + c.value, sum.1 + c.gradient));
+        Self {
+            value,
+            gradient,
+            per_vertex: (value + gradient) as f64 / vertices.max(1) as f64,
+            by_stage: spent.iter().map(|(stage, counts)| ((*stage).to_owned(), *counts)).collect(),
+        }
+    }
 }
 
 /// Folded triangles.
@@ -69,12 +169,31 @@ pub struct Flips {
 /// Distances, in parts of the bounding-box diagonal of the truth.
 #[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
 pub struct Distance {
-    /// Mean over both directions.
+    /// Mean of the two directions' means.
     pub mean: f64,
-    /// Root mean square over both directions.
+    /// Root of the mean of the two directions' mean squares.
     pub rms: f64,
     /// Largest of both directions.
     pub max: f64,
+    /// From samples of the surface to the truth.
+    pub surface_to_truth: OneWay,
+    /// From samples of the truth to the surface.
+    pub truth_to_surface: OneWay,
+}
+
+/// Distances in one direction, in parts of the bounding-box diagonal of the truth, and normals there.
+#[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
+pub struct OneWay {
+    /// Mean, by area.
+    pub mean: f64,
+    /// Root mean square, by area.
+    pub rms: f64,
+    /// Largest, vertices included.
+    pub max: f64,
+    /// Mean of |n . n'|, face normals.
+    pub normal_consistency: f64,
+    /// Mean of n . n', face normals.
+    pub normal_consistency_signed: f64,
 }
 
 /// Distortion of sphere -> surface and of UV -> surface.
@@ -118,4 +237,54 @@ pub struct Seconds {
     pub finish: f64,
     /// Writing outputs.
     pub write: f64,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::fixtures::*;
+    use super::*;
+    use glam::DVec3;
+
+    fn report(surface: &Surface, threads: usize) -> Report {
+        with_settings(threads, |settings| {
+            let (field, tally) = (Balls::one(0.5), Tally::new());
+            let sampler = Sampler::new(&field, *settings, &tally);
+            let spent = BTreeMap::from([("resample", Counts { value: 1000, gradient: 500 })]);
+            let report = measure(surface, &sampler, &spent, &ShrinkSpec::default()).unwrap();
+            assert_eq!(tally.total(), Counts::default(), "measuring is not counted");
+            report
+        })
+    }
+
+    #[test]
+    fn a_sphere_on_its_field_passes() {
+        let surface = sphere_surface(LatticeSpec::default(), 0.5);
+        let found = report(&surface, 2);
+        assert_eq!(passes(&found), Ok(()));
+        assert!(found.distance.max < 5e-4 && found.normal_consistency_signed > 0.999, "{found:?}");
+        assert_eq!((found.evaluations.value, found.evaluations.gradient), (1000, 500));
+        assert!((found.evaluations.per_vertex - 1500.0 / 19802.0).abs() < 1e-12);
+        let one = Report { threads: 2, ..report(&surface, 1) };
+        assert_eq!(one, found, "the number of threads changes nothing else");
+    }
+
+    #[test]
+    fn every_broken_condition_is_named() {
+        let mut surface = sphere_surface(LatticeSpec::Octahedral { n: 20 }, 0.5);
+        surface.positions[400] = (1.3 * DVec3::from_array(surface.positions[400].map(f64::from))).as_vec3().to_array();
+        surface.triangles[3].swap(0, 1);
+        let faults = passes(&report(&surface, 1)).unwrap_err();
+        for part in ["not closed", "folded over on the surface", "turned over on the sphere", "largest distance"] {
+            assert!(faults.iter().any(|f| f.contains(part)), "{part}: {faults:?}");
+        }
+    }
+
+    #[test]
+    fn the_report_survives_json() {
+        let found = report(&sphere_surface(LatticeSpec::Octahedral { n: 8 }, 0.5), 1);
+        let text = serde_json::to_string(&found).unwrap();
+        let back: Report = serde_json::from_str(&text).unwrap();
+        assert_eq!(back.flips, found.flips);
+        assert!((back.distance.mean - found.distance.mean).abs() < 1e-15);
+    }
 }

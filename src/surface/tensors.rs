@@ -1,1 +1,114 @@
-//! (to be written)
+//! A surface as safetensors, for numeric use: everything on the grid, row by row.
+//!
+//! | tensor | shape | type |
+//! |---|---|---|
+//! | `positions` | [rows, columns, 3] | f32, scene units |
+//! | `normals` | [rows, columns, 3] | f32, unit gradients |
+//! | `uv` | [rows, columns, 2] | f32, v downwards |
+//! | `gradient_norm`, `value` | [rows, columns] | f32 |
+//! | `first_form` | [rows, columns, 3] | f32: E, F, G (see [`forms`](super::forms)) |
+//! | `second_form` | [rows, columns, 3] | f32: L, M, N |
+//! | `vertex` | [rows, columns] | u32, the welded vertex of each grid point |
+//! | `triangles` | [n, 3] | u32, welded vertices, counter-clockwise outward |
+//!
+//! The metadata has one entry, `shrinkd`: JSON with `format`, `version`, `lattice`, `rows`, `columns`, `vertices` and
+//! `coordinates` (what the forms are taken by). The same surface gives the same bytes.
+
+use super::Surface;
+use super::forms::forms;
+use crate::shrink::lattice::LatticeSpec;
+use safetensors::tensor::{Dtype, TensorView};
+use serde_json::json;
+use std::collections::HashMap;
+
+/// Version of the layout above.
+const FORMAT: u32 = 1;
+
+/// The surface as a safetensors file.
+pub fn to_safetensors(surface: &Surface) -> Vec<u8> {
+    let lattice = &surface.lattice;
+    let (rows, columns) = (lattice.rows, lattice.columns);
+    let forms = forms(surface);
+    let on_grid = |values: &[[f32; 3]]| -> Vec<u8> {
+        lattice.grid.iter().flat_map(|&v| values[v as usize]).flat_map(f32::to_le_bytes).collect()
+    };
+    let scalar =
+        |values: &[f32]| -> Vec<u8> { lattice.grid.iter().flat_map(|&v| values[v as usize].to_le_bytes()).collect() };
+    let bytes = |values: &[[f32; 3]]| -> Vec<u8> { values.iter().flatten().flat_map(|x| x.to_le_bytes()).collect() };
+    // on both lattices the UV of a grid point is its place in the square, the poles' row included
+    let uv: Vec<u8> = (0..rows * columns)
+        .flat_map(|k| [(k % columns) as f32 / (columns - 1) as f32, (k / columns) as f32 / (rows - 1) as f32])
+        .flat_map(f32::to_le_bytes)
+        .collect();
+    let whole = |values: &mut dyn Iterator<Item = u32>| -> Vec<u8> { values.flat_map(u32::to_le_bytes).collect() };
+    let tensors: Vec<(&str, Dtype, Vec<usize>, Vec<u8>)> = vec![
+        ("positions", Dtype::F32, vec![rows, columns, 3], on_grid(&surface.positions)),
+        ("normals", Dtype::F32, vec![rows, columns, 3], on_grid(&surface.normals)),
+        ("uv", Dtype::F32, vec![rows, columns, 2], uv),
+        ("gradient_norm", Dtype::F32, vec![rows, columns], scalar(&surface.gradient_norms)),
+        ("value", Dtype::F32, vec![rows, columns], scalar(&surface.values)),
+        ("first_form", Dtype::F32, vec![rows, columns, 3], bytes(&forms.first)),
+        ("second_form", Dtype::F32, vec![rows, columns, 3], bytes(&forms.second)),
+        ("vertex", Dtype::U32, vec![rows, columns], whole(&mut lattice.grid.iter().copied())),
+        (
+            "triangles",
+            Dtype::U32,
+            vec![surface.triangles.len(), 3],
+            whole(&mut surface.triangles.iter().flatten().copied()),
+        ),
+    ];
+    let about = json!({
+        "format": FORMAT,
+        "version": env!("CARGO_PKG_VERSION"),
+        "lattice": lattice.spec,
+        "rows": rows,
+        "columns": columns,
+        "vertices": surface.positions.len(),
+        "coordinates": match lattice.spec {
+            LatticeSpec::Latlong { .. } => ["theta", "phi"],
+            LatticeSpec::Octahedral { .. } => ["u", "v"],
+        },
+    });
+    // one entry: the order of several would change from run to run
+    let metadata = HashMap::from([("shrinkd".to_owned(), about.to_string())]);
+    let views = tensors.iter().map(|(name, dtype, shape, data)| {
+        (*name, TensorView::new(*dtype, shape.clone(), data).expect("as many bytes as the shape says"))
+    });
+    safetensors::serialize(views, Some(metadata)).expect("a header far under the format's limit")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::measure::fixtures::sphere_surface;
+    use safetensors::SafeTensors;
+
+    #[test]
+    fn every_tensor_is_there_in_its_shape_and_the_bytes_do_not_change() {
+        let surface = sphere_surface(LatticeSpec::Latlong { n_theta: 12, n_phi: 6 }, 0.5);
+        let bytes = to_safetensors(&surface);
+        assert_eq!(bytes, to_safetensors(&surface));
+        let file = SafeTensors::deserialize(&bytes).unwrap();
+        for (name, shape) in [
+            ("positions", vec![7, 13, 3]),
+            ("normals", vec![7, 13, 3]),
+            ("uv", vec![7, 13, 2]),
+            ("gradient_norm", vec![7, 13]),
+            ("value", vec![7, 13]),
+            ("first_form", vec![7, 13, 3]),
+            ("second_form", vec![7, 13, 3]),
+            ("vertex", vec![7, 13]),
+            ("triangles", vec![surface.triangles.len(), 3]),
+        ] {
+            assert_eq!(file.tensor(name).unwrap().shape(), shape, "{name}");
+        }
+        let (_, header) = SafeTensors::read_metadata(&bytes).unwrap();
+        let about = header.metadata().as_ref().unwrap()["shrinkd"].clone();
+        let about: serde_json::Value = serde_json::from_str(&about).unwrap();
+        assert_eq!(about["coordinates"], json!(["theta", "phi"]));
+        // the last grid row is the south pole in every column
+        let data = file.tensor("positions").unwrap().data().to_vec();
+        let z = f32::from_le_bytes(data[data.len() - 4..].try_into().unwrap());
+        assert_eq!(z, -0.5);
+    }
+}

@@ -1,1 +1,11 @@
-//! it
+//! Tests of the whole program from outside: the real binary, over HTTP and on the command line.
+
+mod app;
+mod cli;
+mod conditional;
+mod contract;
+mod control;
+mod faults;
+mod metrics;
+mod refusals;
+mod walk;

@@ -92,6 +92,14 @@ pub(super) fn refuse(faults: Vec<Fault>) -> Result<(), FieldError> {
 }
 
 impl FieldOptions {
+    /// Checks what can be told without the field.
+    ///
+    /// # Errors
+    /// [`FieldError::Invalid`] with every fault; pointers from the root of the options.
+    pub fn check(&self) -> Result<(), FieldError> {
+        refuse(self.faults())
+    }
+
     /// What is wrong whatever the field.
     pub(super) fn faults(&self) -> Vec<Fault> {
         let mut faults = Vec::new();

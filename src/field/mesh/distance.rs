@@ -21,7 +21,7 @@ use std::sync::OnceLock;
 const MARGIN: f64 = 0.12;
 /// Nearer to the surface than this share of the bounding box's diagonal, the direction to the nearest point is rounding,
 /// and the pseudo-normal is the gradient.
-const ON_SURFACE: f64 = 1e-13;
+const ON_SURFACE: f64 = 1e-9;
 /// A pseudo-normal decides the sign when the point is this far from lying across it (as a cosine); a closed surface
 /// leaves such points only at needles.
 const UNDECIDED: f64 = 1e-7;

@@ -1,0 +1,196 @@
+//! The command line: reads arguments, and hands over to the rooms.
+//!
+//! Exit codes: 0 done; 1 failed, or made a result that did not pass its own checks; 2 bad usage; 3 bad input; 4 the shape
+//! could not be wrapped.
+
+pub mod extract;
+pub mod healthcheck;
+pub mod serve;
+
+use crate::field::Domain;
+use crate::field::input::{DomainName, DomainOption};
+use crate::shrink::Method;
+use crate::shrink::lattice::LatticeSpec;
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+/// Something failed that is neither usage nor input.
+pub const FAILED: u8 = 1;
+/// The arguments make no sense.
+pub const BAD_USAGE: u8 = 2;
+/// The input cannot be read as a field.
+pub const BAD_INPUT: u8 = 3;
+/// The shape could not be wrapped.
+pub const NOT_WRAPPED: u8 = 4;
+
+/// Signed distance fields in, parameterized surfaces out.
+#[derive(Debug, Parser)]
+#[command(version, about, arg_required_else_help = true)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Run the service
+    Serve(ServeArgs),
+    /// Wrap one field: exits 0 when the result is closed, has Euler characteristic 2 and no flips
+    Extract(ExtractArgs),
+    /// Print the description of the service (OpenAPI 3.1, YAML)
+    Openapi,
+    /// Ask a service whether it is ready: exits 0 when it is
+    Healthcheck {
+        /// Address of the service, such as http://127.0.0.1:8080
+        url: String,
+    },
+}
+
+/// Arguments of `serve`.
+#[derive(Debug, Args)]
+pub struct ServeArgs {
+    /// Address to listen on [default: 127.0.0.1:8080]
+    #[arg(long)]
+    pub listen: Option<SocketAddr>,
+    /// Folder of the database and the blobs [default: ./shrinkd-data]
+    #[arg(long, value_name = "DIR")]
+    pub data: Option<PathBuf>,
+    /// Configuration file (TOML)
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+}
+
+/// Arguments of `extract`.
+#[derive(Debug, Args)]
+pub struct ExtractArgs {
+    /// The field: a scene, a network, a mesh or a sampled grid, told by its content
+    pub field: PathBuf,
+    /// Where the GLB goes
+    #[arg(short, long, value_name = "OUT.glb")]
+    pub output: PathBuf,
+    /// How the sphere is contracted
+    #[arg(long, value_enum, default_value_t = MethodArg::Adaptive)]
+    pub method: MethodArg,
+    /// Where the sphere is sampled: latlong:N_THETAxN_PHI or octahedral:N
+    #[arg(long, value_parser = parse_lattice, default_value = "latlong:200x100")]
+    pub lattice: LatticeSpec,
+    /// Latent code of an auto-decoder: a JSON list of numbers
+    #[arg(long, value_name = "FILE.json", conflicts_with = "latent_row")]
+    pub latent: Option<PathBuf>,
+    /// Row of the input's own table of latent codes
+    #[arg(long, value_name = "N")]
+    pub latent_row: Option<u32>,
+    /// Box that holds the zero level set (of a grid: that its samples span): fit, or X0,Y0,Z0,X1,Y1,Z1
+    #[arg(long, value_name = "BOX", value_parser = parse_domain, allow_hyphen_values = true)]
+    pub domain: Option<DomainOption>,
+    /// Where the report goes (JSON)
+    #[arg(long, value_name = "R.json")]
+    pub report: Option<PathBuf>,
+    /// Where the picture goes (PNG)
+    #[arg(long, value_name = "P.png")]
+    pub preview: Option<PathBuf>,
+    /// Where positions, normals, UVs and fundamental forms go (safetensors)
+    #[arg(long, value_name = "S.safetensors")]
+    pub surface: Option<PathBuf>,
+    /// Where the curve of a 2-D scene goes (SVG) [default: beside the GLB]
+    #[arg(long, value_name = "C.svg")]
+    pub svg: Option<PathBuf>,
+    /// Threads; 0 is one per core. The result does not depend on it
+    #[arg(long, default_value_t = 0)]
+    pub threads: usize,
+}
+
+/// How the sphere is contracted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum MethodArg {
+    /// Topology-keeping contraction and a bijective sphere map
+    Adaptive,
+    /// The paper's loop as printed
+    Paper,
+}
+
+impl From<MethodArg> for Method {
+    fn from(method: MethodArg) -> Self {
+        match method {
+            MethodArg::Adaptive => Method::Adaptive,
+            MethodArg::Paper => Method::Paper,
+        }
+    }
+}
+
+/// `latlong:200x100` or `octahedral:72`.
+fn parse_lattice(text: &str) -> Result<LatticeSpec, String> {
+    let number = |n: &str| n.parse::<u32>().map_err(|_| format!("{n:?} is not a whole number"));
+    let lattice = match text.split_once(':') {
+        Some(("latlong", sizes)) => {
+            let (n_theta, n_phi) = sizes.split_once('x').ok_or("expected latlong:N_THETAxN_PHI")?;
+            LatticeSpec::Latlong { n_theta: number(n_theta)?, n_phi: number(n_phi)? }
+        }
+        Some(("octahedral", n)) => LatticeSpec::Octahedral { n: number(n)? },
+        _ => return Err("expected latlong:N_THETAxN_PHI or octahedral:N".to_owned()),
+    };
+    let faults = crate::job::spec::check_lattice(lattice, "");
+    match faults.first() {
+        Some(fault) => Err(format!("{}: {}", fault.pointer.trim_start_matches('/'), fault.detail)),
+        None => Ok(lattice),
+    }
+}
+
+/// `fit`, or six numbers.
+fn parse_domain(text: &str) -> Result<DomainOption, String> {
+    if text == "fit" {
+        return Ok(DomainOption::Named(DomainName::Fit));
+    }
+    let expected = "expected fit or X0,Y0,Z0,X1,Y1,Z1";
+    let corners: Vec<f64> = text.split(',').map(str::parse).collect::<Result<_, _>>().map_err(|_| expected)?;
+    let [x0, y0, z0, x1, y1, z1] = corners[..] else { return Err(expected.to_owned()) };
+    Ok(DomainOption::Box(Domain { min: [x0, y0, z0], max: [x1, y1, z1] }))
+}
+
+/// Runs the command line of this process.
+pub fn run() -> ExitCode {
+    match Cli::parse().command {
+        Command::Serve(args) => serve::run(&args),
+        Command::Extract(args) => extract::run(&args),
+        Command::Openapi => openapi(),
+        Command::Healthcheck { url } => healthcheck::run(&url),
+    }
+}
+
+fn openapi() -> ExitCode {
+    match crate::http::document().to_yaml() {
+        Ok(yaml) => {
+            print!("{yaml}");
+            ExitCode::SUCCESS
+        }
+        Err(error) => fail(FAILED, &error),
+    }
+}
+
+/// Says on standard error what is wrong.
+fn fail(code: u8, error: &dyn std::fmt::Display) -> ExitCode {
+    eprintln!("shrinkd: {error}");
+    ExitCode::from(code)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_lattice_is_read_as_it_is_written_and_kept_within_limits() {
+        assert_eq!(parse_lattice("latlong:200x100"), Ok(LatticeSpec::Latlong { n_theta: 200, n_phi: 100 }));
+        assert_eq!(parse_lattice("octahedral:72"), Ok(LatticeSpec::Octahedral { n: 72 }));
+        for wrong in ["latlong:200", "octahedral:x", "cube:3", "octahedral:501", "latlong:7x100", "octahedral:-1"] {
+            assert!(parse_lattice(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn the_arguments_are_consistent() {
+        use clap::CommandFactory as _;
+        Cli::command().debug_assert();
+    }
+}

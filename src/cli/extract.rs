@@ -1,0 +1,143 @@
+//! `shrinkd extract`: one field in, files out, and one line that says how good they are.
+
+use super::{BAD_INPUT, ExtractArgs, FAILED, NOT_WRAPPED, fail};
+use crate::field::input::FieldOptions;
+use crate::job::failure::Ended;
+use crate::job::pipeline::{self, CurveMade, Made};
+use crate::job::spec::{FieldSpec, OutputName};
+use crate::settings::{CancelToken, Progress, Settings};
+use crate::shrink::ShrinkSpec;
+use indicatif::{ProgressBar, ProgressStyle};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::Instant;
+
+/// Steps of the bar.
+const STEPS: u64 = 1000;
+
+/// Wraps one field.
+pub fn run(args: &ExtractArgs) -> ExitCode {
+    match extract(args) {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => fail(
+            FAILED,
+            &"the result did not pass its own checks (a surface: closed, Euler characteristic 2, no flips; a curve: closed, simple)",
+        ),
+        Err((code, error)) => fail(code, &error),
+    }
+}
+
+/// Whether the result passed its checks; or an exit code and what to say.
+fn extract(args: &ExtractArgs) -> Result<bool, (u8, String)> {
+    let clock = Instant::now();
+    let bytes = std::fs::read(&args.field).map_err(|e| (BAD_INPUT, format!("{}: {e}", args.field.display())))?;
+    let options = FieldOptions {
+        latent: read_latent(args)?,
+        latent_row: args.latent_row,
+        domain: args.domain,
+        ..FieldOptions::default()
+    };
+    let spec = FieldSpec { options, ..FieldSpec::default() };
+    let in_field = |detail: &str| format!("{}: {detail}", args.field.display());
+    let opened = pipeline::open(&spec, Some(&bytes), "").map_err(|failure| {
+        let places: String = failure.errors.iter().map(|e| format!("\n  {}: {}", e.pointer, e.detail)).collect();
+        (BAD_INPUT, in_field(&format!("{}{places}", failure.detail)))
+    })?;
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads).build();
+    let pool = pool.map_err(|e| (FAILED, e.to_string()))?;
+    let (cancel, bar) = (CancelToken::new(), progress_bar());
+    let progress = |progress: Progress| {
+        bar.set_position((f64::from(progress.fraction) * STEPS as f64) as u64);
+        bar.set_message(progress.stage);
+    };
+    let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress };
+    let shrink = ShrinkSpec { method: args.method.into(), lattice: args.lattice };
+    let load = clock.elapsed().as_secs_f64();
+    let ended = |ended: Ended| match ended {
+        Ended::Failed(failure) if failure.is_bad_input() => (BAD_INPUT, in_field(&failure.detail)),
+        Ended::Failed(failure) => (NOT_WRAPPED, in_field(&format!("{} ({})", failure.detail, failure.code))),
+        Ended::Canceled => (FAILED, "canceled".to_owned()),
+    };
+    if opened.field.dimension() == 2 {
+        let made = pipeline::make_curve(opened.field.as_ref(), &shrink, settings).map_err(ended)?;
+        bar.finish_and_clear();
+        let svg = args.svg.clone().unwrap_or_else(|| args.output.with_extension("svg"));
+        write(&args.output, &made.glb)?;
+        write(&svg, &made.svg)?;
+        println!("{}", curve_summary(args, &svg, &made, clock.elapsed().as_secs_f64()));
+        return Ok(made.is_sound());
+    }
+    let files = wanted(args);
+    let outputs: Vec<OutputName> = files.iter().map(|(output, _)| *output).collect();
+    let made = pipeline::make(&opened, &shrink, &outputs, load, settings).map_err(ended)?;
+    bar.finish_and_clear();
+    for ((_, path), (_, bytes)) in files.iter().zip(&made.files) {
+        write(path, bytes)?;
+    }
+    println!("{}", summary(args, &made, clock.elapsed().as_secs_f64()));
+    Ok(made.is_sound())
+}
+
+/// Which outputs go where, in the order of [`OutputName`].
+fn wanted(args: &ExtractArgs) -> Vec<(OutputName, PathBuf)> {
+    let files = [
+        (OutputName::Glb, Some(&args.output)),
+        (OutputName::Surface, args.surface.as_ref()),
+        (OutputName::Preview, args.preview.as_ref()),
+        (OutputName::Report, args.report.as_ref()),
+    ];
+    files.into_iter().filter_map(|(output, path)| Some((output, path?.clone()))).collect()
+}
+
+fn read_latent(args: &ExtractArgs) -> Result<Option<Vec<f32>>, (u8, String)> {
+    let Some(path) = &args.latent else { return Ok(None) };
+    let wrong = |e: &dyn std::fmt::Display| (BAD_INPUT, format!("{}: {e}", path.display()));
+    let text = std::fs::read(path).map_err(|e| wrong(&e))?;
+    let latent: Vec<f32> = serde_json::from_slice(&text).map_err(|e| wrong(&e))?;
+    if latent.iter().all(|z| z.is_finite()) { Ok(Some(latent)) } else { Err(wrong(&"a number is not finite")) }
+}
+
+fn write(path: &Path, bytes: &[u8]) -> Result<(), (u8, String)> {
+    std::fs::write(path, bytes).map_err(|e| (FAILED, format!("{}: {e}", path.display())))
+}
+
+/// A bar on a terminal, nothing elsewhere.
+fn progress_bar() -> ProgressBar {
+    let bar = ProgressBar::new(STEPS);
+    if let Ok(style) = ProgressStyle::with_template("{bar:40} {percent:>3} % {msg} {elapsed}") {
+        bar.set_style(style);
+    }
+    bar
+}
+
+fn name(path: &Path) -> std::borrow::Cow<'_, str> {
+    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy()
+}
+
+fn summary(args: &ExtractArgs, made: &Made, seconds: f64) -> String {
+    let report = &made.report;
+    let flips = report.flips.surface + report.flips.sphere + report.flips.uv;
+    format!(
+        "{} -> {}: {} vertices, {:.1} evaluations per vertex, {flips} flips, NC {:.4}, max distance {:.2} %, {seconds:.2} s",
+        name(&args.field),
+        name(&args.output),
+        report.vertices,
+        report.evaluations.per_vertex,
+        report.normal_consistency,
+        100.0 * report.distance.max,
+    )
+}
+
+fn curve_summary(args: &ExtractArgs, svg: &Path, made: &CurveMade, seconds: f64) -> String {
+    let report = &made.report;
+    format!(
+        "{} -> {}, {}: {} samples, {:.1} evaluations per sample, {} self-intersections, max distance {:.2} %, {seconds:.2} s",
+        name(&args.field),
+        name(&args.output),
+        name(svg),
+        report.samples,
+        report.evaluations.total() as f64 / report.samples.max(1) as f64,
+        report.self_intersections,
+        100.0 * report.to_zero_set.max.max(report.from_zero_set.max),
+    )
+}

@@ -1,0 +1,102 @@
+//! `shrinkd serve`: puts the rooms together and runs them until a signal comes.
+
+use super::{BAD_USAGE, FAILED, ServeArgs, fail};
+use crate::blobs::Blobs;
+use crate::config::Config;
+use crate::engine::Engine;
+use crate::engine::sqlite::{SqliteEngine, Terms};
+use crate::http::{self, App};
+use crate::job::worker::Worker;
+use crate::telemetry;
+use serde::Serialize;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::net::TcpListener;
+use tokio::signal::unix::{SignalKind, signal};
+use tokio_util::sync::CancellationToken;
+
+/// Time from the signal to the end of the process at most; what has not ended by then is taken up after the next start.
+const DRAIN: Duration = Duration::from_secs(4);
+
+/// What the command line says; absent members leave the configuration as it is.
+#[derive(Serialize)]
+struct Flags<'a> {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    listen: Option<std::net::SocketAddr>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    data_dir: Option<&'a std::path::Path>,
+}
+
+/// Runs the service until SIGTERM or SIGINT.
+pub fn run(args: &ServeArgs) -> ExitCode {
+    let flags = Flags { listen: args.listen, data_dir: args.data.as_deref() };
+    let config = match Config::load(args.config.as_deref(), flags) {
+        Ok(config) => config,
+        Err(error) => return fail(BAD_USAGE, &error),
+    };
+    if let Err(error) = telemetry::start(&config.log) {
+        return fail(BAD_USAGE, &error);
+    }
+    let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
+        Ok(runtime) => runtime,
+        Err(error) => return fail(FAILED, &error),
+    };
+    let result = runtime.block_on(serve(config));
+    // a computation that did not see its token in time must not hold up the end
+    runtime.shutdown_background();
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => fail(FAILED, &error),
+    }
+}
+
+async fn serve(config: Config) -> Result<(), Box<dyn std::error::Error>> {
+    let terms = Terms { lease: Duration::from_secs(config.worker.lease_s), max_losses: config.worker.max_losses };
+    let engine: Arc<dyn Engine> = Arc::new(SqliteEngine::open(&config.data_dir, terms)?);
+    let blobs = Blobs::in_folder(&config.data_dir.join("blobs"))?;
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(config.worker.threads)
+        .thread_name(|i| format!("pool-{i}"))
+        .build()?;
+    let stop = CancellationToken::new();
+    let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
+
+    let listener = TcpListener::bind(config.listen).await?;
+    let address = listener.local_addr()?;
+    if !address.ip().is_loopback() {
+        tracing::warn!("listening beyond loopback without authentication: whoever reaches this address can use it");
+    }
+    let worker = Worker {
+        engine: engine.clone(),
+        blobs: blobs.clone(),
+        pool: Arc::new(pool),
+        slots: config.worker.slots,
+        name: format!("worker-{}", uuid::Uuid::now_v7()),
+    };
+    let worker = tokio::spawn(worker.run(stop.clone()));
+    let app = App { engine, blobs, limits: config.limits.clone(), stop: stop.clone() };
+    let router = http::router(app, &config.cors_origins);
+    let graceful = axum::serve(listener, router).with_graceful_shutdown(stop.clone().cancelled_owned());
+    let server = tokio::spawn(graceful.into_future());
+    // the program that started this one may wait for this line
+    tracing::info!(http.address = %address, data.dir = %config.data_dir.display(), "listening");
+
+    tokio::select! {
+        _ = terminate.recv() => tracing::info!(signal = "SIGTERM", "stopping"),
+        _ = interrupt.recv() => tracing::info!(signal = "SIGINT", "stopping"),
+    }
+    stop.cancel();
+    let drained = async {
+        let (server, worker) = tokio::join!(server, worker);
+        server??;
+        worker?;
+        Ok::<_, Box<dyn std::error::Error>>(())
+    };
+    match tokio::time::timeout(DRAIN, drained).await {
+        Ok(result) => result?,
+        Err(_) => tracing::warn!("stopped before everything had ended"),
+    }
+    tracing::info!("stopped");
+    Ok(())
+}

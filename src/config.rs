@@ -1,0 +1,154 @@
+//! Configuration of the service: defaults, then a TOML file, then `SHRINKD_*` variables, then the command line.
+//!
+//! In variables a level is two underscores: `SHRINKD_WORKER__SLOTS=4`. Unknown names are refused, in the file and in the
+//! environment. The defaults need nothing: one folder, loopback only.
+
+use figment::Figment;
+use figment::providers::{Env, Format, Serialized, Toml};
+use serde::{Deserialize, Serialize};
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+
+/// Everything that can be set.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Address to listen on (`SHRINKD_LISTEN`). Loopback, because there is no authentication.
+    pub listen: SocketAddr,
+    /// Folder of the database and the blobs (`SHRINKD_DATA_DIR`), made when it is not there.
+    pub data_dir: PathBuf,
+    /// Origins whose pages may call the service (`SHRINKD_CORS_ORIGINS`, a list); none.
+    pub cors_origins: Vec<String>,
+    /// Sizes of requests.
+    pub limits: Limits,
+    /// The worker.
+    pub worker: WorkerConfig,
+    /// The log.
+    pub log: LogConfig,
+}
+
+/// Sizes of requests.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Limits {
+    /// Bytes of a JSON body (`SHRINKD_LIMITS__BODY_BYTES`): 1 MiB holds a scene of ten thousand nodes.
+    pub body_bytes: u64,
+    /// Bytes of an uploaded input (`SHRINKD_LIMITS__INPUT_BYTES`): 256 MiB, held in memory while it is checked.
+    pub input_bytes: u64,
+}
+
+/// The worker.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WorkerConfig {
+    /// Jobs at once (`SHRINKD_WORKER__SLOTS`): 2, so that one loads or writes while another computes.
+    pub slots: usize,
+    /// Threads of the pool that all jobs share (`SHRINKD_WORKER__THREADS`): 0 is one per core.
+    pub threads: usize,
+    /// Seconds a job is held without a heartbeat (`SHRINKD_WORKER__LEASE_S`).
+    pub lease_s: u64,
+    /// Lost workers after which a job is failed (`SHRINKD_WORKER__MAX_LOSSES`).
+    pub max_losses: u32,
+}
+
+/// The log, on standard error.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LogConfig {
+    /// `pretty` or `json` (`SHRINKD_LOG__FORMAT`).
+    pub format: LogFormat,
+    /// What is logged (`SHRINKD_LOG__FILTER`), in the syntax of `tracing-subscriber`: `info`.
+    pub filter: String,
+}
+
+/// How a line of the log is written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum LogFormat {
+    /// For a person.
+    Pretty,
+    /// One JSON object per line.
+    Json,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
+            data_dir: PathBuf::from("./shrinkd-data"),
+            cors_origins: Vec::new(),
+            limits: Limits { body_bytes: 1 << 20, input_bytes: 256 << 20 },
+            worker: WorkerConfig { slots: 2, threads: 0, lease_s: 30, max_losses: 5 },
+            log: LogConfig { format: LogFormat::Pretty, filter: "info".to_owned() },
+        }
+    }
+}
+
+/// Variables of the project that are no settings of the service: test data, and the renewal of stored metrics.
+const NOT_SETTINGS: [&str; 2] = ["DATA", "RENEW_METRICS"];
+
+impl Config {
+    /// Reads the configuration; `flags` are what the command line says.
+    ///
+    /// # Errors
+    /// When the file cannot be read, a name is unknown, or a value is of the wrong kind or impossible.
+    pub fn load(file: Option<&Path>, flags: impl Serialize) -> Result<Self, ConfigError> {
+        let mut figment = Figment::from(Serialized::defaults(Config::default()));
+        if let Some(file) = file {
+            figment = figment.merge(Toml::file_exact(file));
+        }
+        let environment = Env::prefixed("SHRINKD_").ignore(&NOT_SETTINGS).split("__");
+        let config: Config =
+            figment.merge(environment).merge(Serialized::defaults(flags)).extract().map_err(Box::new)?;
+        let wrong = [
+            (config.worker.slots == 0, "worker.slots must be at least 1"),
+            (config.worker.lease_s == 0, "worker.lease_s must be at least 1"),
+            (config.worker.max_losses == 0, "worker.max_losses must be at least 1"),
+            (config.limits.body_bytes == 0 || config.limits.input_bytes == 0, "limits must be at least 1"),
+        ];
+        match wrong.iter().find(|(is_wrong, _)| *is_wrong) {
+            Some((_, why)) => Err(ConfigError::Impossible(why)),
+            None => Ok(config),
+        }
+    }
+}
+
+/// Why a configuration was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// It cannot be read.
+    #[error("configuration: {0}")]
+    Unreadable(#[from] Box<figment::Error>),
+    /// It asks for what cannot work.
+    #[error("configuration: {0}")]
+    Impossible(&'static str),
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn flags_go_before_the_file_and_the_file_before_the_defaults() {
+        let folder = tempfile::tempdir().expect("folder");
+        let file = folder.path().join("shrinkd.toml");
+        std::fs::write(&file, "listen = \"127.0.0.1:1\"\n[worker]\nslots = 7\n").expect("writes");
+        let flags = figment::util::map!["listen" => "127.0.0.1:2"];
+        let config = Config::load(Some(&file), flags).expect("loads");
+        assert_eq!((config.listen.port(), config.worker.slots, config.worker.lease_s), (2, 7, 30));
+    }
+
+    #[test]
+    fn unknown_names_and_impossible_values_are_refused() {
+        let folder = tempfile::tempdir().expect("folder");
+        let file = folder.path().join("shrinkd.toml");
+        for (text, named) in
+            [("lisen = \"x\"", "lisen"), ("[worker]\nslots = 0", "slots"), ("[log]\nformat = \"xml\"", "xml")]
+        {
+            std::fs::write(&file, text).expect("writes");
+            let error =
+                Config::load(Some(&file), figment::util::map!["log" => figment::util::map!["filter" => "info"]]);
+            assert!(error.as_ref().is_err_and(|e| e.to_string().contains(named)), "{text}: {error:?}");
+        }
+    }
+}

@@ -1,0 +1,311 @@
+//! Queue, leases, records and events behind one trait, so that one node and a cluster are the same service.
+//!
+//! Guarantees of every engine, checked by [`conformance`]: a submitted job is durable before [`Engine::submit`] returns; it
+//! is held by one worker at a time, in attempts that are numbered from 1; only the newest attempt can change it, and it ends
+//! once; its events are numbered from 1 without a gap, and are durable before anyone reads them.
+//! Not guaranteed: that a job runs only once (a worker that is lost in the middle is followed by another attempt), and that
+//! old events are kept (a reader that comes too late gets a fresh snapshot).
+
+pub mod conformance;
+pub mod sqlite;
+
+use crate::job::{Event, EventKind, Failure, Job, JobId, JobSpec, Output, ProgressView, State};
+use futures::stream::BoxStream;
+use jiff::Timestamp;
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// A key that makes a submit repeatable, and what it was used for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct IdempotencyKey {
+    /// The key, as the client chose it.
+    pub key: String,
+    /// Hash of the request that it stands for.
+    pub fingerprint: String,
+}
+
+/// A job to accept.
+#[derive(Clone, Debug)]
+pub struct NewJob {
+    /// Its name.
+    pub id: JobId,
+    /// The checked request.
+    pub spec: JobSpec,
+    /// The key of the request, if it has one.
+    pub key: Option<IdempotencyKey>,
+}
+
+/// What became of a submit.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Submitted {
+    /// The job was accepted.
+    Created(Job),
+    /// The key was used before for the same request: the job as it was accepted then.
+    Replayed(Job),
+    /// The key was used before for another request.
+    KeyConflict,
+    /// A submit with this key is not finished yet.
+    InFlight,
+}
+
+/// What to list, newest first.
+#[derive(Clone, Debug, Default)]
+pub struct ListQuery {
+    /// Only jobs older than this one.
+    pub before: Option<JobId>,
+    /// Only jobs in one of these states; empty means all.
+    pub states: Vec<State>,
+    /// Only jobs with all these labels.
+    pub labels: Vec<(String, String)>,
+    /// Only jobs accepted at this time or later.
+    pub created_from: Option<Timestamp>,
+    /// Only jobs accepted before this time.
+    pub created_to: Option<Timestamp>,
+    /// How many at most.
+    pub limit: usize,
+}
+
+/// One page of a list.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Page {
+    /// The jobs, newest first.
+    pub jobs: Vec<Job>,
+    /// Whether there are more.
+    pub more: bool,
+}
+
+/// What became of a wish to forget a job.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Forgotten {
+    /// It is gone; these output hashes (hexadecimal SHA-256) are named by no job any more.
+    Gone(Vec<String>),
+    /// It has not ended.
+    Running,
+    /// There is no such job.
+    Unknown,
+}
+
+/// A worker's hold on a job for one attempt.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Claim {
+    /// The job.
+    pub id: JobId,
+    /// The attempt, from 1.
+    pub attempt: u32,
+    /// The request.
+    pub spec: JobSpec,
+    /// Who holds it.
+    pub worker: String,
+    /// How long the hold lasts without a renewal.
+    pub lease: Duration,
+}
+
+/// News from a worker about its claim.
+#[derive(Clone, Debug)]
+pub struct Update {
+    /// `Progress` or `Mesh`.
+    pub kind: EventKind,
+    /// The body of the event.
+    pub data: serde_json::Value,
+    /// The record's new progress, where there is one.
+    pub progress: Option<ProgressView>,
+}
+
+/// What a renewal found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Renewal {
+    /// The claim holds.
+    Keep,
+    /// The claim holds, and the job is to be stopped.
+    CancelRequested,
+    /// Another attempt has begun, or the job has ended: stop, nothing of this attempt counts.
+    Lost,
+}
+
+/// How an attempt ended.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Outcome {
+    /// With outputs, which are durable already, and the report.
+    Succeeded {
+        /// The outputs.
+        outputs: Vec<Output>,
+        /// The report.
+        metrics: serde_json::Value,
+    },
+    /// With a problem.
+    Failed(Failure),
+    /// It was stopped because it was asked to.
+    Canceled,
+    /// It was given back unfinished, because its worker is stopping; another worker will take it up.
+    Released,
+}
+
+/// What an engine can fail with. The text is for the log, not for clients.
+#[derive(Debug, thiserror::Error)]
+pub enum EngineError {
+    /// The claim was lost: another attempt has begun, or the job has ended.
+    #[error("attempt {attempt} of job {id} is fenced off")]
+    Fenced {
+        /// The job.
+        id: JobId,
+        /// The attempt that came too late.
+        attempt: u32,
+    },
+    /// The store behind failed.
+    #[error("engine: {0}")]
+    Store(String),
+    /// The engine was shut down.
+    #[error("the engine has stopped")]
+    Stopped,
+}
+
+/// The queue and the records. See the module for the guarantees.
+#[async_trait::async_trait]
+pub trait Engine: Send + Sync {
+    /// Accepts a job.
+    async fn submit(&self, job: NewJob) -> Result<Submitted, EngineError>;
+    /// The record of a job.
+    async fn get(&self, id: JobId) -> Result<Option<Job>, EngineError>;
+    /// A page of records.
+    async fn list(&self, query: ListQuery) -> Result<Page, EngineError>;
+    /// Asks for a job to be stopped: a queued one ends at once, a running one is told. The record afterwards.
+    async fn request_cancel(&self, id: JobId) -> Result<Option<Job>, EngineError>;
+    /// Forgets an ended job.
+    async fn forget(&self, id: JobId) -> Result<Forgotten, EngineError>;
+
+    /// Takes up to `slots` jobs, oldest first, waiting at most `wait` for the first.
+    async fn claim(&self, worker: &str, slots: usize, wait: Duration) -> Result<Vec<Claim>, EngineError>;
+    /// Extends a claim and tells its news.
+    async fn renew(&self, claim: &Claim, news: Vec<Update>) -> Result<Renewal, EngineError>;
+    /// Returns when a claimed job is to be stopped or the claim was lost, as soon as the engine learns of it.
+    async fn interrupted(&self, claim: &Claim) -> Renewal;
+    /// Ends an attempt.
+    ///
+    /// # Errors
+    /// [`EngineError::Fenced`] when the claim was lost.
+    async fn finish(&self, claim: &Claim, outcome: Outcome) -> Result<(), EngineError>;
+
+    /// The stored events of a job after a sequence number, at most `limit`; `None` when there is no such job.
+    async fn events_after(&self, id: JobId, after: u64, limit: usize) -> Result<Option<EventPage>, EngineError>;
+    /// The job's events from now on. Every change of a record is told by an event.
+    fn changes(&self, id: JobId) -> Changes;
+    /// Whether the engine can do its work.
+    async fn health(&self) -> Result<(), EngineError>;
+}
+
+/// A stretch of a job's events, and where it stands in the whole.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EventPage {
+    /// The events, in order.
+    pub events: Vec<Event>,
+    /// The oldest sequence number that is still kept (0 when none is).
+    pub oldest: u64,
+    /// The newest sequence number.
+    pub newest: u64,
+    /// The record at the same moment.
+    pub job: Job,
+}
+
+/// The live events of one job.
+pub struct Changes(pub tokio::sync::broadcast::Receiver<Arc<Event>>);
+
+impl Changes {
+    /// The next event since the last call (or since subscribing); `None` when some were dropped because the reader was
+    /// slow, so that the engine must be asked.
+    pub async fn next(&mut self) -> Option<Arc<Event>> {
+        use tokio::sync::broadcast::error::RecvError;
+        match self.0.recv().await {
+            Ok(event) => Some(event),
+            Err(RecvError::Lagged(_)) => None,
+            // the engine is gone: nothing will change any more
+            Err(RecvError::Closed) => std::future::pending().await,
+        }
+    }
+}
+
+/// Events read at once from the engine by a follower.
+const PAGE: usize = 64;
+
+/// The events of a job as they happen: from `after` on when that is still kept, else from a fresh snapshot. Ends after the
+/// `done` event. `None` when there is no such job.
+pub async fn follow(
+    engine: Arc<dyn Engine>,
+    id: JobId,
+    after: Option<u64>,
+) -> Result<Option<BoxStream<'static, Result<Event, EngineError>>>, EngineError> {
+    // subscribed before reading, so that nothing falls between
+    let changes = engine.changes(id);
+    let Some(page) = engine.events_after(id, after.unwrap_or(u64::MAX), PAGE).await? else { return Ok(None) };
+    let mut follower = Follower { engine, id, changes, pending: VecDeque::new(), position: 0, over: false };
+    match after {
+        Some(after) if after <= page.newest && after.saturating_add(1) >= page.oldest => {
+            follower.position = after;
+            follower.pending.extend(page.events);
+        }
+        _ => follower.start_over(&page),
+    }
+    let stream = futures::stream::unfold(follower, |mut follower| async move {
+        follower.next().await.transpose().map(|event| (event, follower))
+    });
+    Ok(Some(Box::pin(stream)))
+}
+
+struct Follower {
+    engine: Arc<dyn Engine>,
+    id: JobId,
+    changes: Changes,
+    pending: VecDeque<Event>,
+    /// Sequence number of the last event that was given out.
+    position: u64,
+    over: bool,
+}
+
+impl Follower {
+    /// Goes on from a snapshot. The last event of an ended job comes after it, so that every stream ends with `done`.
+    fn start_over(&mut self, page: &EventPage) {
+        let seq = if page.job.state.ended() { page.newest.saturating_sub(1) } else { page.newest };
+        let data = serde_json::to_value(&page.job).unwrap_or_default();
+        self.pending = VecDeque::from([Event { seq, kind: EventKind::Snapshot, at: Timestamp::now(), data }]);
+    }
+
+    async fn next(&mut self) -> Result<Option<Event>, EngineError> {
+        while !self.over {
+            if let Some(event) = self.pending.pop_front() {
+                self.position = event.seq;
+                self.over = event.kind == EventKind::Done;
+                return Ok(Some(event));
+            }
+            // live events that follow without a gap need no look into the engine
+            let mut fresh = None;
+            while let Ok(event) = self.changes.0.try_recv() {
+                if event.seq == self.position + 1 {
+                    fresh = Some(event);
+                    break;
+                }
+            }
+            if let Some(event) = fresh {
+                self.pending.push_back(Event::clone(&event));
+                continue;
+            }
+            let page =
+                self.engine.events_after(self.id, self.position, PAGE).await.inspect_err(|_| self.over = true)?;
+            match page {
+                None => self.over = true,
+                Some(page) if page.events.is_empty() => {
+                    if page.job.state.ended() && self.position >= page.newest {
+                        self.over = true;
+                    } else if let Some(event) = self.changes.next().await
+                        && event.seq == self.position + 1
+                    {
+                        self.pending.push_back(Event::clone(&event));
+                    }
+                }
+                // the reader was slower than the trimming of old events
+                Some(page) if page.oldest > self.position + 1 => self.start_over(&page),
+                Some(page) => self.pending.extend(page.events),
+            }
+        }
+        Ok(None)
+    }
+}

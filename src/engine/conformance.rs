@@ -1,0 +1,333 @@
+//! One suite for every engine: the promises of the [module above](super), as claims that panic when broken.
+//!
+//! ```no_run
+//! # async fn example(engine: std::sync::Arc<dyn shrinkd::engine::Engine>) {
+//! // the engine's leases must last `conformance::LEASE`, and it must give up after two lost attempts
+//! shrinkd::engine::conformance::run(engine).await;
+//! # }
+//! ```
+
+use super::{
+    Claim, Engine, EngineError, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Renewal, Submitted, Update,
+    follow,
+};
+use crate::job::{Event, EventKind, Failure, JobId, JobSpec, Output, ProgressView, State};
+use futures::StreamExt;
+use serde_json::json;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// The lease that an engine under test is opened with: long enough for a slow machine to renew, short enough to wait for.
+pub const LEASE: Duration = Duration::from_millis(1500);
+/// Longer than any step of the suite may take.
+const PATIENCE: Duration = Duration::from_secs(20);
+
+/// A small valid job, not submitted yet.
+pub fn new_job() -> NewJob {
+    labeled("suite", "conformance")
+}
+
+fn labeled(name: &str, value: &str) -> NewJob {
+    let request = json!({"field": {"scene": {"sphere": {"radius": 0.5}}}, "labels": {name: value}});
+    let spec =
+        JobSpec::from_value(&request).unwrap_or_else(|faults| panic!("the suite's own job is refused: {faults:?}"));
+    NewJob { id: JobId::new(), spec, key: None }
+}
+
+/// Runs every claim, one after the other, on an engine that holds no job.
+///
+/// # Panics
+/// When the engine breaks a promise.
+pub async fn run(engine: Arc<dyn Engine>) {
+    a_job_lives_from_submit_to_its_end(&engine).await;
+    jobs_are_claimed_oldest_first_and_once(&engine).await;
+    a_key_makes_a_submit_repeatable(&engine).await;
+    a_queued_job_is_canceled_at_once(&engine).await;
+    a_running_job_is_told_to_stop(&engine).await;
+    a_worker_that_lost_its_lease_cannot_finish(&engine).await;
+    a_renewed_lease_holds(&engine).await;
+    a_job_that_is_given_back_runs_again(&engine).await;
+    a_job_that_is_lost_too_often_fails(&engine).await;
+    a_reader_that_comes_back_misses_nothing(&engine).await;
+    a_waiting_worker_gets_a_job_as_it_comes(&engine).await;
+    lists_are_newest_first_paged_and_filtered(&engine).await;
+    only_an_ended_job_is_forgotten(&engine).await;
+    engine.health().await.expect("healthy");
+}
+
+async fn submit(engine: &Arc<dyn Engine>, job: NewJob) -> JobId {
+    match engine.submit(job).await.expect("submits") {
+        Submitted::Created(job) => job.id,
+        other => panic!("expected a new job, found {other:?}"),
+    }
+}
+
+async fn claim_one(engine: &Arc<dyn Engine>, worker: &str) -> Claim {
+    let mut claims = engine.claim(worker, 1, PATIENCE).await.expect("claims");
+    assert_eq!(claims.len(), 1, "one slot, one claim");
+    claims.remove(0)
+}
+
+async fn state(engine: &Arc<dyn Engine>, id: JobId) -> State {
+    engine.get(id).await.expect("reads").expect("is there").state
+}
+
+fn success(sha256: &str) -> Outcome {
+    let output = Output {
+        name: "glb".to_owned(),
+        href: String::new(),
+        media_type: "model/gltf-binary".to_owned(),
+        bytes: 1,
+        sha256: sha256.to_owned(),
+    };
+    Outcome::Succeeded { outputs: vec![output], metrics: json!({"vertices": 1}) }
+}
+
+fn progress(fraction: f32) -> Update {
+    let progress = ProgressView { stage: "contract".to_owned(), fraction, ..ProgressView::default() };
+    Update { kind: EventKind::Progress, data: json!({"fraction": fraction}), progress: Some(progress) }
+}
+
+async fn a_job_lives_from_submit_to_its_end(engine: &Arc<dyn Engine>) {
+    let id = submit(engine, new_job()).await;
+    let queued = engine.get(id).await.expect("reads").expect("is there");
+    assert_eq!((queued.state, queued.attempt, queued.started_at), (State::Queued, 0, None));
+    let claim = claim_one(engine, "a").await;
+    assert_eq!((claim.id, claim.attempt), (id, 1));
+    let running = engine.get(id).await.expect("reads").expect("is there");
+    assert_eq!(running.state, State::Running);
+    assert!(running.revision > queued.revision && running.started_at.is_some());
+    assert_eq!(engine.renew(&claim, vec![progress(0.5)]).await.expect("renews"), Renewal::Keep);
+    let later = engine.get(id).await.expect("reads").expect("is there");
+    assert!(later.revision > running.revision);
+    assert_eq!(later.progress.map(|p| p.fraction), Some(0.5));
+    engine.finish(&claim, success("aa")).await.expect("finishes");
+    let ended = engine.get(id).await.expect("reads").expect("is there");
+    assert_eq!(ended.state, State::Succeeded);
+    assert_eq!((ended.outputs.len(), ended.problem), (1, None));
+    assert!(ended.finished_at >= ended.started_at && ended.metrics.is_some());
+    let again = engine.finish(&claim, success("bb")).await;
+    assert!(matches!(again, Err(EngineError::Fenced { .. })), "a job ends once: {again:?}");
+    assert_eq!(engine.renew(&claim, Vec::new()).await.expect("answers"), Renewal::Lost);
+    assert_eq!(engine.get(JobId::new()).await.expect("reads"), None);
+}
+
+async fn jobs_are_claimed_oldest_first_and_once(engine: &Arc<dyn Engine>) {
+    let mut ids = Vec::new();
+    for _ in 0..6 {
+        ids.push(submit(engine, new_job()).await);
+    }
+    let (a, b) = tokio::join!(engine.claim("a", 3, PATIENCE), engine.claim("b", 3, PATIENCE));
+    let claims = [a.expect("claims"), b.expect("claims")].concat();
+    let mut claimed: Vec<JobId> = claims.iter().map(|c| c.id).collect();
+    claimed.sort_unstable();
+    assert_eq!(claimed, ids, "each job is claimed, and once");
+    assert!(engine.claim("c", 3, Duration::ZERO).await.expect("claims").is_empty());
+    for claim in claims {
+        engine.finish(&claim, Outcome::Failed(Failure::internal())).await.expect("finishes");
+        let job = engine.get(claim.id).await.expect("reads").expect("is there");
+        assert_eq!(job.problem.map(|p| p.code).as_deref(), Some("internal"));
+    }
+}
+
+async fn a_key_makes_a_submit_repeatable(engine: &Arc<dyn Engine>) {
+    let keyed = |fingerprint: &str| NewJob {
+        key: Some(IdempotencyKey { key: "k".to_owned(), fingerprint: fingerprint.to_owned() }),
+        ..new_job()
+    };
+    let mut racing = Vec::new();
+    for _ in 0..8 {
+        let (engine, job) = (engine.clone(), keyed("one"));
+        racing.push(tokio::spawn(async move { engine.submit(job).await.expect("submits") }));
+    }
+    let (mut created, mut answers) = (0, Vec::new());
+    for submit in racing {
+        match submit.await.expect("no panic") {
+            Submitted::Created(job) => {
+                created += 1;
+                answers.push(job);
+            }
+            Submitted::Replayed(job) => answers.push(job),
+            Submitted::InFlight => {}
+            Submitted::KeyConflict => panic!("the same request is no conflict"),
+        }
+    }
+    assert_eq!(created, 1, "one key, one job");
+    assert!(answers.windows(2).all(|w| w[0] == w[1]), "every answer is the same");
+    assert_eq!(engine.submit(keyed("two")).await.expect("answers"), Submitted::KeyConflict);
+    let claim = claim_one(engine, "a").await;
+    engine.finish(&claim, Outcome::Canceled).await.expect("finishes");
+    let replayed = engine.submit(keyed("one")).await.expect("answers");
+    assert_eq!(replayed, Submitted::Replayed(answers.remove(0)), "the same answer after the end, too");
+}
+
+async fn a_queued_job_is_canceled_at_once(engine: &Arc<dyn Engine>) {
+    let id = submit(engine, new_job()).await;
+    let job = engine.request_cancel(id).await.expect("cancels").expect("is there");
+    assert_eq!(job.state, State::Canceled);
+    assert!(engine.claim("a", 1, Duration::ZERO).await.expect("claims").is_empty());
+    let again = engine.request_cancel(id).await.expect("answers").expect("is there");
+    assert_eq!(again, job, "cancelling what has ended changes nothing");
+    assert_eq!(engine.request_cancel(JobId::new()).await.expect("answers"), None);
+}
+
+async fn a_running_job_is_told_to_stop(engine: &Arc<dyn Engine>) {
+    submit(engine, new_job()).await;
+    let claim = claim_one(engine, "a").await;
+    let waiting = tokio::spawn({
+        let (engine, claim) = (engine.clone(), claim.clone());
+        async move { engine.interrupted(&claim).await }
+    });
+    let job = engine.request_cancel(claim.id).await.expect("cancels").expect("is there");
+    assert_eq!(job.state, State::Canceling);
+    let told = tokio::time::timeout(PATIENCE, waiting).await.expect("in time").expect("no panic");
+    assert_eq!(told, Renewal::CancelRequested);
+    assert_eq!(engine.renew(&claim, Vec::new()).await.expect("answers"), Renewal::CancelRequested);
+    engine.finish(&claim, Outcome::Canceled).await.expect("finishes");
+    assert_eq!(state(engine, claim.id).await, State::Canceled);
+}
+
+async fn a_worker_that_lost_its_lease_cannot_finish(engine: &Arc<dyn Engine>) {
+    let id = submit(engine, new_job()).await;
+    let first = claim_one(engine, "frozen").await;
+    let second = claim_one(engine, "b").await;
+    assert_eq!((second.id, second.attempt), (id, 2));
+    assert_eq!(engine.renew(&first, vec![progress(0.9)]).await.expect("answers"), Renewal::Lost);
+    assert_eq!(engine.interrupted(&first).await, Renewal::Lost);
+    assert!(matches!(engine.finish(&first, success("aa")).await, Err(EngineError::Fenced { .. })));
+    let job = engine.get(id).await.expect("reads").expect("is there");
+    assert_eq!((job.state, job.progress), (State::Running, None), "the lost attempt left no trace");
+    engine.finish(&second, success("bb")).await.expect("finishes");
+    assert_eq!(engine.get(id).await.expect("reads").expect("is there").outputs[0].sha256, "bb");
+}
+
+async fn a_renewed_lease_holds(engine: &Arc<dyn Engine>) {
+    submit(engine, new_job()).await;
+    let claim = claim_one(engine, "a").await;
+    for _ in 0..4 {
+        tokio::time::sleep(LEASE / 3).await;
+        assert_eq!(engine.renew(&claim, Vec::new()).await.expect("renews"), Renewal::Keep);
+    }
+    assert!(engine.claim("b", 1, Duration::ZERO).await.expect("claims").is_empty());
+    engine.finish(&claim, Outcome::Canceled).await.expect("finishes");
+}
+
+async fn a_job_that_is_given_back_runs_again(engine: &Arc<dyn Engine>) {
+    let id = submit(engine, new_job()).await;
+    // more often than a job may be lost: giving back is no loss
+    for attempt in 1..=4 {
+        let claim = claim_one(engine, "stopping").await;
+        assert_eq!((claim.id, claim.attempt), (id, attempt));
+        engine.finish(&claim, Outcome::Released).await.expect("gives back");
+        assert_eq!(state(engine, id).await, State::Queued);
+    }
+    engine.request_cancel(id).await.expect("cancels");
+}
+
+async fn a_job_that_is_lost_too_often_fails(engine: &Arc<dyn Engine>) {
+    let id = submit(engine, new_job()).await;
+    for attempt in 1..=2 {
+        assert_eq!(claim_one(engine, "doomed").await.attempt, attempt);
+    }
+    assert!(engine.claim("b", 1, LEASE * 2).await.expect("claims").is_empty());
+    let job = engine.get(id).await.expect("reads").expect("is there");
+    assert_eq!(job.state, State::Failed);
+    assert_eq!(job.problem.map(|p| p.code).as_deref(), Some("attempts_exhausted"));
+}
+
+async fn collect(engine: &Arc<dyn Engine>, id: JobId, after: Option<u64>) -> Vec<Event> {
+    let stream = follow(engine.clone(), id, after).await.expect("follows").expect("is there");
+    let all = stream.map(|event| event.expect("reads")).collect::<Vec<_>>();
+    tokio::time::timeout(PATIENCE, all).await.expect("the stream ends with the job")
+}
+
+async fn a_reader_that_comes_back_misses_nothing(engine: &Arc<dyn Engine>) {
+    let id = submit(engine, new_job()).await;
+    let live = tokio::spawn({
+        let engine = engine.clone();
+        async move { collect(&engine, id, Some(0)).await }
+    });
+    let claim = claim_one(engine, "a").await;
+    for i in 0..100 {
+        engine.renew(&claim, vec![progress(i as f32 / 100.0)]).await.expect("renews");
+    }
+    engine.finish(&claim, success("aa")).await.expect("finishes");
+
+    let live = live.await.expect("no panic");
+    let numbers: Vec<u64> = live.iter().map(|e| e.seq).collect();
+    assert_eq!(numbers, (1..=numbers.len() as u64).collect::<Vec<_>>(), "numbered from 1 without a gap");
+    assert_eq!(live.len(), 104, "queued, running, 100 times progress, succeeded, done");
+    assert_eq!(live.last().map(|e| e.kind), Some(EventKind::Done));
+    for after in [0, 1, 50, 103] {
+        let rest = collect(engine, id, Some(after)).await;
+        assert_eq!(rest, live[after as usize..], "after {after}");
+    }
+    assert_eq!(collect(engine, id, Some(104)).await, [], "nothing comes after the end");
+    let fresh = collect(engine, id, None).await;
+    assert_eq!(fresh.iter().map(|e| e.kind).collect::<Vec<_>>(), [EventKind::Snapshot, EventKind::Done]);
+    assert_eq!(fresh[0].data["state"], "succeeded");
+    let ahead = collect(engine, id, Some(9999)).await;
+    assert_eq!(ahead[0].kind, EventKind::Snapshot, "a number that was never given out starts over");
+    assert!(follow(engine.clone(), JobId::new(), None).await.expect("answers").is_none());
+}
+
+async fn a_waiting_worker_gets_a_job_as_it_comes(engine: &Arc<dyn Engine>) {
+    let waiting = tokio::spawn({
+        let engine = engine.clone();
+        async move { claim_one(&engine, "a").await }
+    });
+    tokio::task::yield_now().await;
+    let id = submit(engine, new_job()).await;
+    let claim = tokio::time::timeout(PATIENCE, waiting).await.expect("in time").expect("no panic");
+    assert_eq!(claim.id, id);
+    engine.finish(&claim, Outcome::Canceled).await.expect("finishes");
+}
+
+async fn lists_are_newest_first_paged_and_filtered(engine: &Arc<dyn Engine>) {
+    let mut ids = Vec::new();
+    for i in 0..5 {
+        ids.push(submit(engine, labeled("list", if i % 2 == 0 { "even" } else { "odd" })).await);
+    }
+    ids.reverse();
+    engine.request_cancel(ids[0]).await.expect("cancels");
+    let list = async |query: ListQuery| {
+        let page = engine.list(query).await.expect("lists");
+        (page.jobs.iter().map(|j| j.id).collect::<Vec<_>>(), page.more)
+    };
+    let query = ListQuery { limit: 3, ..ListQuery::default() };
+    assert_eq!(list(query.clone()).await, (ids[..3].to_vec(), true));
+    let next = ListQuery { before: Some(ids[2]), limit: 2, ..ListQuery::default() };
+    assert_eq!(list(next).await, (ids[3..].to_vec(), true), "older jobs of the suite follow");
+    let odd = ListQuery { labels: vec![("list".to_owned(), "odd".to_owned())], ..query.clone() };
+    assert_eq!(list(odd).await, (vec![ids[1], ids[3]], false));
+    let queued = ListQuery {
+        labels: vec![("list".to_owned(), "even".to_owned())],
+        states: vec![State::Queued, State::Running],
+        ..query.clone()
+    };
+    assert_eq!(list(queued).await, (vec![ids[2], ids[4]], false));
+    let job = engine.get(ids[0]).await.expect("reads").expect("is there");
+    let older = ListQuery { created_to: Some(job.created_at), created_from: Some(job.created_at), ..query };
+    assert_eq!(list(older).await, (Vec::new(), false), "from is included, to is not");
+    for id in &ids[1..] {
+        engine.request_cancel(*id).await.expect("cancels");
+    }
+}
+
+async fn only_an_ended_job_is_forgotten(engine: &Arc<dyn Engine>) {
+    let mut ids = Vec::new();
+    for _ in 0..2 {
+        ids.push(submit(engine, new_job()).await);
+        let claim = claim_one(engine, "a").await;
+        assert_eq!(engine.forget(claim.id).await.expect("answers"), Forgotten::Running);
+        engine.finish(&claim, success("shared")).await.expect("finishes");
+    }
+    assert_eq!(
+        engine.forget(ids[0]).await.expect("forgets"),
+        Forgotten::Gone(Vec::new()),
+        "the other job names it too"
+    );
+    assert_eq!(engine.forget(ids[1]).await.expect("forgets"), Forgotten::Gone(vec!["shared".to_owned()]));
+    assert_eq!(engine.forget(ids[1]).await.expect("answers"), Forgotten::Unknown);
+    assert_eq!(engine.get(ids[1]).await.expect("reads"), None);
+}

@@ -1,0 +1,359 @@
+//! The embedded engine: SQLite in a folder, for one process.
+//!
+//! WAL with `synchronous=FULL`: a commit is on the disk before anyone hears of it. One thread writes; what is waiting when it
+//! begins is committed together, so that many submits share one sync. Readers have connections of their own and never
+//! wait for the writer. A lock file keeps a second process out, so every claim found at the start belongs to a dead worker.
+
+mod records;
+mod schema;
+mod writer;
+
+use super::{
+    Changes, Claim, Engine, EngineError, EventPage, Forgotten, ListQuery, NewJob, Outcome, Page, Renewal, Submitted,
+    Update,
+};
+use crate::job::{Failure, Job, JobId, JobSpec, State};
+use records::{Change, Ctx};
+use rusqlite::{Connection, OptionalExtension, params};
+use std::fs::{File, TryLockError};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+use tokio::sync::Notify;
+use writer::{Hub, Writer};
+
+/// How long an idempotency key is kept.
+const KEY_LIFETIME_MS: i64 = 24 * 60 * 60 * 1000;
+/// How often a worker that waits for a job looks for leases that ran out.
+const SWEEP: Duration = Duration::from_secs(1);
+
+/// How leases and attempts are judged.
+#[derive(Clone, Copy, Debug)]
+pub struct Terms {
+    /// How long a claim lasts without a renewal.
+    pub lease: Duration,
+    /// Lost attempts after which a job is failed.
+    pub max_losses: u32,
+}
+
+impl Default for Terms {
+    /// 30 s (three heartbeats of 10 s), and five losses: a job that kills its worker five times is poison.
+    fn default() -> Self {
+        Self { lease: Duration::from_secs(30), max_losses: 5 }
+    }
+}
+
+/// The embedded engine.
+pub struct SqliteEngine {
+    writer: Writer,
+    readers: Arc<Mutex<Vec<Connection>>>,
+    path: PathBuf,
+    hub: Arc<Hub>,
+    queued: Arc<Notify>,
+    terms: Terms,
+    _lock: File,
+}
+
+impl SqliteEngine {
+    /// Opens the engine in a folder, making what is not there, and gives every job that a dead process held back to the
+    /// queue.
+    ///
+    /// # Errors
+    /// When the folder cannot be written, when another process has it, or when the database is of a newer version.
+    pub fn open(folder: &Path, terms: Terms) -> Result<Self, EngineError> {
+        std::fs::create_dir_all(folder).map_err(|e| EngineError::Store(format!("{}: {e}", folder.display())))?;
+        let lock_path = folder.join("shrinkd.lock");
+        let lock = File::create(&lock_path).map_err(|e| EngineError::Store(format!("{}: {e}", lock_path.display())))?;
+        lock.try_lock().map_err(|e| match e {
+            TryLockError::WouldBlock => EngineError::Store(format!("another process uses {}", folder.display())),
+            TryLockError::Error(e) => EngineError::Store(format!("{}: {e}", lock_path.display())),
+        })?;
+        let path = folder.join("shrinkd.sqlite3");
+        let mut connection = connect(&path)?;
+        schema::migrate(&mut connection)?;
+        let hub = Arc::new(Hub::default());
+        let lost = writer::once(&mut connection, &hub, |ctx| records::requeue_lost(ctx, i64::MAX, terms.max_losses))?;
+        if lost > 0 {
+            tracing::warn!(jobs = lost, "jobs of an earlier process are taken up again");
+        }
+        let writer = Writer::start(connection, hub.clone())?;
+        let (readers, queued) = (Arc::default(), Arc::new(Notify::new()));
+        Ok(Self { writer, readers, path, hub, queued, terms, _lock: lock })
+    }
+
+    async fn write<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&mut Ctx<'_>) -> rusqlite::Result<T> + Send + 'static,
+    ) -> Result<T, EngineError> {
+        self.writer.run(work).await
+    }
+
+    async fn read<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&Connection) -> rusqlite::Result<T> + Send + 'static,
+    ) -> Result<T, EngineError> {
+        let (readers, path) = (self.readers.clone(), self.path.clone());
+        let read = tokio::task::spawn_blocking(move || {
+            let pooled = readers.lock().unwrap_or_else(|e| e.into_inner()).pop();
+            let mut connection = match pooled {
+                Some(connection) => connection,
+                None => connect(&path)?,
+            };
+            // one transaction, so that everything read belongs together; it ends when it is dropped
+            let result = connection.transaction().and_then(|tx| work(&tx))?;
+            readers.lock().unwrap_or_else(|e| e.into_inner()).push(connection);
+            Ok(result)
+        });
+        read.await.map_err(|e| EngineError::Store(e.to_string()))?
+    }
+}
+
+fn connect(path: &Path) -> Result<Connection, EngineError> {
+    let connection = Connection::open(path)?;
+    connection.pragma_update(None, "journal_mode", "WAL")?;
+    connection.pragma_update(None, "synchronous", "FULL")?;
+    connection.pragma_update(None, "foreign_keys", "ON")?;
+    // readers never wait for the writer in WAL mode; this covers the moment of a checkpoint
+    connection.busy_timeout(Duration::from_secs(5))?;
+    Ok(connection)
+}
+
+impl From<rusqlite::Error> for EngineError {
+    fn from(error: rusqlite::Error) -> Self {
+        EngineError::Store(error.to_string())
+    }
+}
+
+#[async_trait::async_trait]
+impl Engine for SqliteEngine {
+    async fn submit(&self, new: NewJob) -> Result<Submitted, EngineError> {
+        let submitted = self.write(move |ctx| submit(ctx, &new)).await?;
+        if matches!(submitted, Submitted::Created(_)) {
+            self.queued.notify_one();
+        }
+        Ok(submitted)
+    }
+
+    async fn get(&self, id: JobId) -> Result<Option<Job>, EngineError> {
+        self.read(move |c| records::read(c, id)).await
+    }
+
+    async fn list(&self, query: ListQuery) -> Result<Page, EngineError> {
+        self.read(move |c| records::list(c, &query)).await
+    }
+
+    async fn request_cancel(&self, id: JobId) -> Result<Option<Job>, EngineError> {
+        self.write(move |ctx| {
+            let Some(job) = records::read(ctx.connection, id)? else { return Ok(None) };
+            match job.state {
+                State::Queued => records::change(ctx, id, Change::to(State::Canceled))?,
+                State::Running => records::change(ctx, id, Change::to(State::Canceling))?,
+                _ => return Ok(Some(job)),
+            }
+            records::read(ctx.connection, id)
+        })
+        .await
+    }
+
+    async fn forget(&self, id: JobId) -> Result<Forgotten, EngineError> {
+        self.write(move |ctx| {
+            let Some(job) = records::read(ctx.connection, id)? else { return Ok(Forgotten::Unknown) };
+            if !job.state.ended() {
+                return Ok(Forgotten::Running);
+            }
+            ctx.connection.execute("DELETE FROM jobs WHERE id = ?1", [id.to_string()])?;
+            let mut unused = Vec::new();
+            for output in &job.outputs {
+                let named = "SELECT 1 FROM outputs WHERE sha256 = ?1 LIMIT 1";
+                if ctx.connection.query_row(named, [&output.sha256], |_| Ok(())).optional()?.is_none() {
+                    unused.push(output.sha256.clone());
+                }
+            }
+            Ok(Forgotten::Gone(unused))
+        })
+        .await
+    }
+
+    async fn claim(&self, worker: &str, slots: usize, wait: Duration) -> Result<Vec<Claim>, EngineError> {
+        let deadline = tokio::time::Instant::now() + wait;
+        loop {
+            let (worker, terms) = (worker.to_owned(), self.terms);
+            let claims = self.write(move |ctx| claim(ctx, &worker, slots, terms)).await?;
+            let now = tokio::time::Instant::now();
+            if !claims.is_empty() || now >= deadline {
+                return Ok(claims);
+            }
+            let _ = tokio::time::timeout_at(deadline.min(now + SWEEP), self.queued.notified()).await;
+        }
+    }
+
+    async fn renew(&self, claim: &Claim, news: Vec<Update>) -> Result<Renewal, EngineError> {
+        let (claim, lease) = (claim.clone(), self.terms.lease);
+        self.write(move |ctx| {
+            let renewal = records::standing(ctx.connection, &claim)?;
+            if renewal == Renewal::Lost {
+                return Ok(renewal);
+            }
+            let until = ctx.now.saturating_add(lease.as_millis() as i64);
+            let renewed = "UPDATE jobs SET lease_until = ?2 WHERE id = ?1";
+            ctx.connection.execute(renewed, params![claim.id.to_string(), until])?;
+            for update in news {
+                records::tell(ctx, claim.id, update)?;
+            }
+            Ok(renewal)
+        })
+        .await
+    }
+
+    async fn interrupted(&self, claim: &Claim) -> Renewal {
+        let mut changes = self.changes(claim.id);
+        loop {
+            let of = claim.clone();
+            match self.read(move |c| records::standing(c, &of)).await {
+                Ok(Renewal::Keep) => {}
+                Ok(interruption) => return interruption,
+                // the next heartbeat will tell whether the engine is really gone
+                Err(error) => tracing::warn!(job.id = %claim.id, %error, "the claim could not be looked at"),
+            }
+            // a change of state by another handle on the same file is seen at the next look
+            let _ = tokio::time::timeout(SWEEP, changes.next()).await;
+        }
+    }
+
+    async fn finish(&self, claim: &Claim, outcome: Outcome) -> Result<(), EngineError> {
+        let of = claim.clone();
+        let released = outcome == Outcome::Released;
+        let held = self.write(move |ctx| {
+            let standing = records::standing(ctx.connection, &of)?;
+            if standing == Renewal::Lost {
+                return Ok(false);
+            }
+            let change = match outcome {
+                Outcome::Succeeded { outputs, metrics } => {
+                    Change { outputs: Some(outputs), metrics: Some(metrics), ..Change::to(State::Succeeded) }
+                }
+                Outcome::Failed(problem) => Change { problem: Some(problem), ..Change::to(State::Failed) },
+                Outcome::Canceled => Change::to(State::Canceled),
+                // a job that is given back while it was to be stopped has stopped
+                Outcome::Released if standing == Renewal::CancelRequested => Change::to(State::Canceled),
+                Outcome::Released => Change::to(State::Queued),
+            };
+            records::change(ctx, of.id, change)?;
+            Ok(true)
+        });
+        if !held.await? {
+            return Err(EngineError::Fenced { id: claim.id, attempt: claim.attempt });
+        }
+        if released {
+            self.queued.notify_one();
+        }
+        Ok(())
+    }
+
+    async fn events_after(&self, id: JobId, after: u64, limit: usize) -> Result<Option<EventPage>, EngineError> {
+        self.read(move |c| records::events_after(c, id, after, limit)).await
+    }
+
+    fn changes(&self, id: JobId) -> Changes {
+        Changes(self.hub.subscribe(id))
+    }
+
+    async fn health(&self) -> Result<(), EngineError> {
+        self.write(|ctx| ctx.connection.query_row("SELECT 1", [], |_| Ok(()))).await
+    }
+}
+
+fn submit(ctx: &mut Ctx<'_>, new: &NewJob) -> rusqlite::Result<Submitted> {
+    if let Some(key) = &new.key {
+        ctx.connection.execute("DELETE FROM idempotency WHERE expires_at <= ?1", [ctx.now])?;
+        let known = "SELECT fingerprint, answer FROM idempotency WHERE key = ?1";
+        let row = |row: &rusqlite::Row<'_>| Ok((row.get::<_, String>(0)?, row.get::<_, String>(1)?));
+        if let Some((fingerprint, answer)) = ctx.connection.query_row(known, [&key.key], row).optional()? {
+            if fingerprint != key.fingerprint {
+                return Ok(Submitted::KeyConflict);
+            }
+            return Ok(Submitted::Replayed(records::from_json(&answer)?));
+        }
+    }
+    records::insert(ctx, new)?;
+    let job = records::read(ctx.connection, new.id)?.ok_or(rusqlite::Error::QueryReturnedNoRows)?;
+    if let Some(key) = &new.key {
+        ctx.connection.execute(
+            "INSERT INTO idempotency (key, fingerprint, answer, expires_at) VALUES (?1, ?2, ?3, ?4)",
+            params![key.key, key.fingerprint, records::to_json(&job)?, ctx.now + KEY_LIFETIME_MS],
+        )?;
+    }
+    Ok(Submitted::Created(job))
+}
+
+fn claim(ctx: &mut Ctx<'_>, worker: &str, slots: usize, terms: Terms) -> rusqlite::Result<Vec<Claim>> {
+    records::requeue_lost(ctx, ctx.now, terms.max_losses)?;
+    let mut claims = Vec::new();
+    while claims.len() < slots {
+        let until = ctx.now.saturating_add(terms.lease.as_millis() as i64);
+        let take = "UPDATE jobs SET state = 'running', attempt = attempt + 1, revision = revision + 1, worker = ?1,
+                        lease_until = ?2, started_at = COALESCE(started_at, ?3), progress = NULL
+                    WHERE id = (SELECT id FROM jobs WHERE state = 'queued' ORDER BY id LIMIT 1)
+                    RETURNING id, attempt, spec";
+        let taken = ctx.connection.query_row(take, params![worker, until, ctx.now], |row| {
+            Ok((row.get::<_, String>(0)?, row.get::<_, u32>(1)?, row.get::<_, String>(2)?))
+        });
+        let Some((id, attempt, spec)) = taken.optional()? else { break };
+        let id: JobId = id.parse().map_err(records::corrupt)?;
+        let spec: serde_json::Value = records::from_json(&spec)?;
+        match JobSpec::from_value(&spec) {
+            Ok(spec) => {
+                records::tell_state(ctx, id)?;
+                claims.push(Claim { id, attempt, spec, worker: worker.to_owned(), lease: terms.lease });
+            }
+            // accepted by another version that knew more
+            Err(faults) => {
+                tracing::error!(job.id = %id, ?faults, "the stored request cannot be read");
+                records::change(ctx, id, Change { problem: Some(Failure::internal()), ..Change::to(State::Failed) })?;
+            }
+        }
+    }
+    Ok(claims)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::conformance;
+
+    fn open(folder: &Path, terms: Terms) -> SqliteEngine {
+        SqliteEngine::open(folder, terms).expect("opens")
+    }
+
+    #[tokio::test]
+    async fn keeps_every_promise_of_an_engine() {
+        let folder = tempfile::tempdir().expect("folder");
+        let lease = conformance::LEASE;
+        let engine = open(folder.path(), Terms { lease, max_losses: 2 });
+        conformance::run(Arc::new(engine)).await;
+    }
+
+    #[tokio::test]
+    async fn a_second_process_is_kept_out() {
+        let folder = tempfile::tempdir().expect("folder");
+        let _first = open(folder.path(), Terms::default());
+        assert!(SqliteEngine::open(folder.path(), Terms::default()).is_err());
+    }
+
+    #[tokio::test]
+    async fn a_job_that_was_running_is_queued_again_at_the_next_start() {
+        let folder = tempfile::tempdir().expect("folder");
+        let engine = open(folder.path(), Terms::default());
+        let job = conformance::new_job();
+        let id = job.id;
+        engine.submit(job).await.expect("submits");
+        let first = engine.claim("a", 1, Duration::ZERO).await.expect("claims");
+        assert_eq!(first.len(), 1);
+        drop(engine);
+        let engine = open(folder.path(), Terms::default());
+        assert_eq!(engine.get(id).await.expect("reads").map(|j| j.state), Some(State::Queued));
+        let again = engine.claim("b", 1, Duration::ZERO).await.expect("claims");
+        assert_eq!(again[0].attempt, 2);
+        assert!(matches!(engine.finish(&first[0], Outcome::Canceled).await, Err(EngineError::Fenced { .. })));
+    }
+}

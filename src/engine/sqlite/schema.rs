@@ -1,0 +1,73 @@
+//! Tables of the embedded engine, and how an older file becomes a newer one.
+
+use crate::engine::EngineError;
+use rusqlite::Connection;
+
+/// One step per version; `user_version` counts the steps that were taken. A step is never edited once released.
+const MIGRATIONS: [&str; 1] = ["
+    CREATE TABLE jobs (
+        id          TEXT PRIMARY KEY,
+        state       TEXT NOT NULL,
+        attempt     INTEGER NOT NULL DEFAULT 0,
+        losses      INTEGER NOT NULL DEFAULT 0,
+        revision    INTEGER NOT NULL DEFAULT 1,
+        last_seq    INTEGER NOT NULL DEFAULT 0,
+        created_at  INTEGER NOT NULL,
+        started_at  INTEGER,
+        finished_at INTEGER,
+        spec        TEXT NOT NULL,
+        labels      TEXT NOT NULL,
+        shrink      TEXT NOT NULL,
+        progress    TEXT,
+        metrics     TEXT,
+        outputs     TEXT NOT NULL DEFAULT '[]',
+        problem     TEXT,
+        worker      TEXT,
+        lease_until INTEGER
+    ) STRICT;
+    CREATE INDEX jobs_open ON jobs (state, id) WHERE state IN ('queued', 'running', 'canceling');
+    CREATE TABLE labels (
+        job   TEXT NOT NULL REFERENCES jobs (id) ON DELETE CASCADE,
+        name  TEXT NOT NULL,
+        value TEXT NOT NULL,
+        PRIMARY KEY (name, value, job)
+    ) STRICT, WITHOUT ROWID;
+    CREATE INDEX labels_of_job ON labels (job);
+    CREATE TABLE outputs (
+        job    TEXT NOT NULL REFERENCES jobs (id) ON DELETE CASCADE,
+        name   TEXT NOT NULL,
+        sha256 TEXT NOT NULL,
+        PRIMARY KEY (job, name)
+    ) STRICT, WITHOUT ROWID;
+    CREATE INDEX outputs_by_hash ON outputs (sha256);
+    CREATE TABLE events (
+        job  TEXT NOT NULL REFERENCES jobs (id) ON DELETE CASCADE,
+        seq  INTEGER NOT NULL,
+        kind TEXT NOT NULL,
+        at   INTEGER NOT NULL,
+        data TEXT NOT NULL,
+        PRIMARY KEY (job, seq)
+    ) STRICT, WITHOUT ROWID;
+    CREATE TABLE idempotency (
+        key         TEXT PRIMARY KEY,
+        fingerprint TEXT NOT NULL,
+        answer      TEXT NOT NULL,
+        expires_at  INTEGER NOT NULL
+    ) STRICT;
+    CREATE INDEX idempotency_by_age ON idempotency (expires_at);
+"];
+
+/// Brings the file to this version.
+pub(super) fn migrate(connection: &mut Connection) -> Result<(), EngineError> {
+    let version: usize = connection.query_row("PRAGMA user_version", [], |row| row.get(0))?;
+    if version > MIGRATIONS.len() {
+        return Err(EngineError::Store(format!("the database is of version {version}, newer than this program")));
+    }
+    for (i, step) in MIGRATIONS.iter().enumerate().skip(version) {
+        let tx = connection.transaction()?;
+        tx.execute_batch(step)?;
+        tx.pragma_update(None, "user_version", i + 1)?;
+        tx.commit()?;
+    }
+    Ok(())
+}

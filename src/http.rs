@@ -1,0 +1,87 @@
+//! The service over HTTP: translates requests into the rooms below, and never computes.
+//!
+//! Guarantees: every answer that is not a success is a problem document (RFC 9457); nothing is promised in an answer before
+//! it is durable; no handler keeps state that another node would miss. Every stream and every long poll ends when the
+//! service stops.
+
+pub mod body;
+pub mod conditional;
+pub mod context;
+pub mod events;
+pub mod health;
+pub mod inputs;
+pub mod jobs;
+pub mod list;
+pub mod openapi;
+pub mod outputs;
+pub mod page;
+pub mod problem;
+pub mod query;
+
+pub use problem::Problem;
+
+use crate::blobs::Blobs;
+use crate::config::Limits;
+use crate::engine::Engine;
+use axum::http::HeaderValue;
+use axum::middleware;
+use std::sync::Arc;
+use tokio_util::sync::CancellationToken;
+use tower_http::catch_panic::CatchPanicLayer;
+use tower_http::cors::CorsLayer;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+/// What handlers work with.
+#[derive(Clone)]
+pub struct App {
+    /// Queue and records.
+    pub engine: Arc<dyn Engine>,
+    /// Bytes.
+    pub blobs: Blobs,
+    /// Sizes that requests may have.
+    pub limits: Limits,
+    /// Raised when the service stops.
+    pub stop: CancellationToken,
+}
+
+/// Every route, with its description.
+fn api() -> OpenApiRouter<App> {
+    OpenApiRouter::with_openapi(openapi::base())
+        // uploaded once, used by many jobs
+        .routes(routes!(inputs::upload))
+        .routes(routes!(inputs::describe))
+        // the life of a job
+        .routes(routes!(jobs::submit, list::list))
+        .routes(routes!(jobs::get, jobs::forget))
+        .routes(routes!(jobs::cancel))
+        .routes(routes!(events::events))
+        .routes(routes!(outputs::download))
+        // for whoever operates it
+        .routes(routes!(health::livez))
+        .routes(routes!(health::readyz))
+        .routes(routes!(openapi::openapi_json))
+        // for a person
+        .routes(routes!(page::page))
+}
+
+/// The description of the service, as it is pinned in `openapi.yaml`.
+pub fn document() -> utoipa::openapi::OpenApi {
+    openapi::complete(api().into_openapi())
+}
+
+/// The service. Browsers of other origins are let in only when `cors_origins` names them.
+pub fn router(app: App, cors_origins: &[String]) -> axum::Router {
+    let (router, _) = api().split_for_parts();
+    let mut router = router
+        .fallback(problem::unknown_route)
+        .method_not_allowed_fallback(problem::wrong_method)
+        .with_state(app)
+        .layer(CatchPanicLayer::custom(problem::panicked));
+    if !cors_origins.is_empty() {
+        let origins: Vec<HeaderValue> = cors_origins.iter().filter_map(|o| o.parse().ok()).collect();
+        let cors = CorsLayer::new().allow_origin(origins).allow_methods(tower_http::cors::Any);
+        router = router.layer(cors.allow_headers(tower_http::cors::Any).expose_headers(tower_http::cors::Any));
+    }
+    router.layer(middleware::from_fn(context::request))
+}

@@ -1,0 +1,61 @@
+//! Reading request bodies under a limit.
+
+use super::Problem;
+use axum::body::Body;
+use axum::http::{HeaderMap, StatusCode, header};
+use bytes::{Bytes, BytesMut};
+use futures::StreamExt;
+use serde_json::Value;
+
+/// Bytes that are still read, and thrown away, from a body that is too large: a client that is not listening yet would
+/// otherwise see a broken connection in place of the answer.
+const MAX_DISCARDED: u64 = 16 << 20;
+
+/// Reads a body of at most `limit` bytes.
+///
+/// # Errors
+/// 413 when it is larger, 400 when it breaks off.
+pub async fn read(body: Body, limit: u64) -> Result<Bytes, Problem> {
+    let mut stream = body.into_data_stream();
+    let (mut bytes, mut discarded) = (BytesMut::new(), 0u64);
+    while let Some(chunk) = stream.next().await {
+        let chunk = chunk.map_err(|error| {
+            tracing::debug!(%error, "a body broke off");
+            Problem::bad_request("incomplete_body", "the body broke off", "the body ended before it was complete")
+        })?;
+        let length = chunk.len() as u64;
+        if discarded > 0 || bytes.len() as u64 + length > limit {
+            bytes = BytesMut::new();
+            discarded += length;
+            if discarded > MAX_DISCARDED {
+                break;
+            }
+        } else {
+            bytes.extend_from_slice(&chunk);
+        }
+    }
+    if discarded > 0 { Err(Problem::too_large(limit)) } else { Ok(bytes.freeze()) }
+}
+
+/// Reads a JSON body of at most `limit` bytes.
+///
+/// # Errors
+/// 415 for another media type, 413 when it is too large, 400 when it is no JSON or nested too deeply.
+pub async fn read_json(headers: &HeaderMap, body: Body, limit: u64) -> Result<Value, Problem> {
+    let media_type = headers.get(header::CONTENT_TYPE).and_then(|v| v.to_str().ok()).unwrap_or("");
+    let essence = media_type.split(';').next().unwrap_or("").trim().to_ascii_lowercase();
+    if essence != "application/json" {
+        let detail = format!("expected application/json, found {media_type:?}");
+        let title = "the body has another media type";
+        return Err(Problem::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "unsupported_media_type", title, detail));
+    }
+    let bytes = read(body, limit).await?;
+    serde_json::from_slice(&bytes).map_err(|error| {
+        // the parser stops at 128 levels and says so only in its message
+        if error.to_string().contains("recursion limit") {
+            let detail = format!("values may be nested 127 deep; line {}, column {}", error.line(), error.column());
+            return Problem::bad_request("too_deep", "the body is nested too deeply", detail);
+        }
+        Problem::bad_request("malformed_json", "the body is not JSON", error.to_string())
+    })
+}

@@ -1,0 +1,338 @@
+//! `/v1/jobs`: submit, look, cancel, forget.
+
+use super::{App, Problem, body, conditional, query};
+use crate::blobs::BlobId;
+use crate::engine::{Forgotten, IdempotencyKey, NewJob, Submitted};
+use crate::field::{Fault, FieldError};
+use crate::job::{Failure, Job, JobId, JobSpec, pipeline};
+use crate::shrink::Method;
+use axum::Json;
+use axum::body::Body;
+use axum::extract::{Path, RawQuery, State};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
+use std::time::Duration;
+
+/// Characters of an idempotency key.
+const MAX_KEY: usize = 255;
+/// Longest hint to come back, seconds: an estimate far ahead is not worth more trust.
+const MAX_RETRY_AFTER: f64 = 30.0;
+/// Evaluations per vertex of the adaptive method, the median over 77 real shapes (design notes, "The adaptive method").
+const ADAPTIVE_EVALUATIONS: f64 = 13.9;
+/// Evaluations per vertex of the paper's loop: one value with gradient in each of its 100 iterations.
+const PAPER_EVALUATIONS: f64 = 100.0;
+
+/// What a job may cost, judged before it runs.
+#[derive(Serialize, utoipa::ToSchema)]
+pub struct Estimate {
+    /// Whether the request would be accepted; always true here, a faulty one is a 422.
+    valid: bool,
+    /// Vertices of the result.
+    vertices: u64,
+    /// Field evaluations, estimated.
+    evaluations: u64,
+}
+
+/// Submits a job
+///
+/// The answer is sent once the job is durable. `Prefer: wait=N` waits up to N seconds (at most 60) for its end and then
+/// answers 200.
+#[utoipa::path(
+    post,
+    path = "/v1/jobs",
+    tag = "jobs",
+    params(
+        ("validate_only" = Option<bool>, Query, description = "check the request and estimate its cost, without submitting it"),
+        ("Idempotency-Key" = Option<String>, Header, description = "makes the submit repeatable for 24 hours"),
+        ("Prefer" = Option<String>, Header, description = "`wait=N`: wait up to N seconds for the end"),
+    ),
+    request_body(content = JobRequest, content_type = "application/json"),
+    responses(
+        (status = 202, description = "accepted", body = Job, headers(
+            ("Location", description = "where the job is"),
+            ("Retry-After", description = "seconds after which to look"),
+            ("Idempotent-Replayed", description = "`true` when this is the answer to an earlier request with the same key"))),
+        (status = 200, description = "ended in time, or (with validate_only) the estimate", body = SubmitAnswer),
+        (status = 400, description = "the body is not JSON, or a header or parameter is malformed"),
+        (status = 409, description = "a request with this key is not finished yet"),
+        (status = 413, description = "the body is too large"),
+        (status = 415, description = "the body is not application/json"),
+        (status = 422, description = "the request is wrong, or its key was used for another request"),
+        (status = 503, description = "the service is stopping"),
+    )
+)]
+pub async fn submit(
+    State(app): State<App>,
+    RawQuery(raw): RawQuery,
+    headers: HeaderMap,
+    body: Body,
+) -> Result<Response, Problem> {
+    let parameters = query::parameters(raw.as_deref(), &["validate_only"], &[])?;
+    let validate_only = query::flag(&parameters, "validate_only")?;
+    let key = idempotency_key(&headers)?;
+    let request = body::read_json(&headers, body, app.limits.body_bytes).await?;
+    // the keys of a JSON value are sorted, so that spaces and order do not make another request
+    let fingerprint = BlobId::of(request.to_string().as_bytes()).hex();
+    let spec = JobSpec::from_value(&request).map_err(|faults| Problem::invalid_request("", &faults))?;
+    let spec = check_field(&app, spec).await?;
+    if validate_only {
+        return Ok(Json(estimate(&spec)).into_response());
+    }
+    if app.stop.is_cancelled() {
+        return Err(Problem::unavailable("stopping", "the service is stopping"));
+    }
+    let key = key.map(|key| IdempotencyKey { key, fingerprint });
+    let (mut job, replayed) = match app.engine.submit(NewJob { id: JobId::new(), spec, key }).await? {
+        Submitted::Created(job) => (job, false),
+        Submitted::Replayed(job) => (job, true),
+        Submitted::KeyConflict => {
+            let detail = "the key was used for another request within the last 24 hours";
+            return Err(Problem::unprocessable(
+                "idempotency_key_reused",
+                "the key was used for another request",
+                detail,
+            ));
+        }
+        Submitted::InFlight => {
+            let detail = "a request with the same key is being worked on";
+            return Err(Problem::conflict("idempotency_key_in_flight", "the key is in use", detail).retry_after(1));
+        }
+    };
+    tracing::info!(job.id = %job.id, replayed, "job submitted");
+    let mut answer = HeaderMap::new();
+    let location = HeaderValue::from_str(&format!("/v1/jobs/{}", job.id)).map_err(|_| Problem::internal())?;
+    answer.insert(header::LOCATION, location);
+    if replayed {
+        answer.insert(HeaderName::from_static("idempotent-replayed"), HeaderValue::from_static("true"));
+    }
+    if let Some(wait) = query::prefer_wait(&headers) {
+        job = wait_until(&app, job.id, wait, |job| job.state.ended()).await?.unwrap_or(job);
+        let applied = HeaderValue::from_str(&format!("wait={}", wait.as_secs())).map_err(|_| Problem::internal())?;
+        answer.insert(HeaderName::from_static("preference-applied"), applied);
+    }
+    let status = if job.state.ended() { StatusCode::OK } else { StatusCode::ACCEPTED };
+    Ok((status, answer, job_answer(job)).into_response())
+}
+
+/// Reads a job
+///
+/// With `wait`, the answer comes when the job has changed from the version in `If-None-Match`, or, without that header,
+/// when it has ended; and in any case after `wait` seconds.
+#[utoipa::path(
+    get,
+    path = "/v1/jobs/{id}",
+    tag = "jobs",
+    params(
+        ("id" = String, Path, description = "the job"),
+        ("wait" = Option<u64>, Query, description = "seconds to wait for news, at most 60"),
+        ("If-None-Match" = Option<String>, Header, description = "versions that are known already"),
+    ),
+    responses(
+        (status = 200, description = "the job; a failed one has its problem inside", body = Job, headers(
+            ("ETag", description = "weak, changes with every revision"),
+            ("Retry-After", description = "seconds after which to look again, while it has not ended"))),
+        (status = 304, description = "it has not changed"),
+        (status = 400, description = "a parameter is malformed"),
+        (status = 404, description = "there is no such job"),
+    )
+)]
+pub async fn get(
+    State(app): State<App>,
+    Path(id): Path<String>,
+    RawQuery(raw): RawQuery,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let parameters = query::parameters(raw.as_deref(), &["wait"], &[])?;
+    let wait = query::wait(&parameters)?.unwrap_or_default();
+    let id = job_id(&id)?;
+    let known = |job: &Job| conditional::names_tag(&headers, header::IF_NONE_MATCH, &tag(job));
+    let conditional = headers.contains_key(header::IF_NONE_MATCH);
+    let news = |job: &Job| if conditional { !known(job) } else { job.state.ended() };
+    let job = wait_until(&app, id, wait, news).await?.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
+    if known(&job) {
+        let answer = [(header::ETAG, tag(&job)), (header::CACHE_CONTROL, "no-cache".to_owned())];
+        return Ok((StatusCode::NOT_MODIFIED, answer).into_response());
+    }
+    Ok(job_answer(job).into_response())
+}
+
+/// Cancels a job
+///
+/// A queued job ends at once; a running one is told to stop. Cancelling what has ended changes nothing.
+#[utoipa::path(
+    post,
+    path = "/v1/jobs/{id}/cancel",
+    tag = "jobs",
+    params(("id" = String, Path, description = "the job")),
+    responses(
+        (status = 202, description = "it is stopping", body = Job),
+        (status = 200, description = "it has ended", body = Job),
+        (status = 400, description = "a query parameter is unknown"),
+        (status = 404, description = "there is no such job"),
+    )
+)]
+pub async fn cancel(
+    State(app): State<App>,
+    Path(id): Path<String>,
+    RawQuery(raw): RawQuery,
+) -> Result<Response, Problem> {
+    query::parameters(raw.as_deref(), &[], &[])?;
+    let id = job_id(&id)?;
+    let job = app.engine.request_cancel(id).await?.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
+    tracing::info!(job.id = %id, job.state = job.state.name(), "cancel requested");
+    let status = if job.state.ended() { StatusCode::OK } else { StatusCode::ACCEPTED };
+    Ok((status, job_answer(job)).into_response())
+}
+
+/// Forgets a job and its outputs
+#[utoipa::path(
+    delete,
+    path = "/v1/jobs/{id}",
+    tag = "jobs",
+    params(("id" = String, Path, description = "the job")),
+    responses(
+        (status = 204, description = "it is gone"),
+        (status = 400, description = "a query parameter is unknown"),
+        (status = 404, description = "there is no such job"),
+        (status = 409, description = "it has not ended"),
+    )
+)]
+pub async fn forget(
+    State(app): State<App>,
+    Path(id): Path<String>,
+    RawQuery(raw): RawQuery,
+) -> Result<StatusCode, Problem> {
+    query::parameters(raw.as_deref(), &[], &[])?;
+    let id = job_id(&id)?;
+    // no job may come to name a blob between the two steps
+    let _sweep = app.blobs.sweep().await;
+    match app.engine.forget(id).await? {
+        Forgotten::Gone(unused) => {
+            for blob in unused.iter().filter_map(|hex| BlobId::from_hex(hex)) {
+                app.blobs.remove(blob).await?;
+            }
+            tracing::info!(job.id = %id, "job forgotten");
+            Ok(StatusCode::NO_CONTENT)
+        }
+        Forgotten::Running => {
+            let detail = "cancel the job first, or wait for its end";
+            Err(Problem::conflict("job_not_ended", "the job has not ended", detail))
+        }
+        Forgotten::Unknown => Err(Problem::unknown_job(&id.to_string())),
+    }
+}
+
+/// The job of that name; what is no name is a job that is not there.
+pub(super) fn job_id(text: &str) -> Result<JobId, Problem> {
+    text.parse().map_err(|_| Problem::unknown_job(text))
+}
+
+/// A job with its version and, while it has not ended, a hint when to look again.
+pub(super) fn job_answer(job: Job) -> impl IntoResponse {
+    let mut headers = HeaderMap::new();
+    headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"));
+    if let Ok(tag) = HeaderValue::from_str(&tag(&job)) {
+        headers.insert(header::ETAG, tag);
+    }
+    if !job.state.ended() {
+        let seconds = job.eta_s.unwrap_or(1.0).ceil().clamp(1.0, MAX_RETRY_AFTER);
+        headers.insert(header::RETRY_AFTER, HeaderValue::from(seconds as u32));
+    }
+    (headers, Json(job))
+}
+
+fn tag(job: &Job) -> String {
+    format!("W/\"{}\"", job.revision)
+}
+
+/// The job once `done` says so, and at the latest after `wait` or when the service stops. `None` when there is no such job.
+async fn wait_until(app: &App, id: JobId, wait: Duration, done: impl Fn(&Job) -> bool) -> Result<Option<Job>, Problem> {
+    let deadline = tokio::time::Instant::now() + wait;
+    let mut changes = (!wait.is_zero()).then(|| app.engine.changes(id));
+    loop {
+        let Some(job) = app.engine.get(id).await? else { return Ok(None) };
+        let Some(changes) = changes.as_mut().filter(|_| !done(&job)) else { return Ok(Some(job)) };
+        tokio::select! {
+            _ = changes.next() => {}
+            () = tokio::time::sleep_until(deadline) => return Ok(Some(job)),
+            () = app.stop.cancelled() => return Ok(Some(job)),
+        }
+    }
+}
+
+fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, Problem> {
+    let mut keys = headers.get_all("idempotency-key").iter();
+    let Some(key) = keys.next() else { return Ok(None) };
+    let text = key.to_str().ok().filter(|k| !k.trim().is_empty() && k.len() <= MAX_KEY);
+    match (text, keys.next()) {
+        (Some(text), None) => Ok(Some(text.trim().to_owned())),
+        _ => Err(Problem::header(format!("Idempotency-Key: expected one key of 1 to {MAX_KEY} visible characters"))),
+    }
+}
+
+/// Checks what the field names: the scene in the request, or the input that must be there.
+async fn check_field(app: &App, spec: JobSpec) -> Result<JobSpec, Problem> {
+    if let Some(id) = spec.field.input {
+        if app.blobs.note(id).await?.is_none() {
+            let detail = format!("no input {id} is stored; upload it to /v1/inputs first");
+            let fault = Fault { pointer: "/field/input".to_owned(), code: "unknown_input", detail };
+            return Err(Problem::invalid_request("", &[fault]));
+        }
+        return Ok(spec);
+    }
+    // a scene may be large: checked off the runtime
+    let (spec, checked) = tokio::task::spawn_blocking(move || {
+        let checked = spec.field.scene.as_ref().map_or(Ok(()), pipeline::check_scene);
+        (spec, checked)
+    })
+    .await
+    .map_err(|error| {
+        tracing::error!(%error, "a scene could not be checked");
+        Problem::internal()
+    })?;
+    match checked {
+        Ok(()) => Ok(spec),
+        Err(FieldError::Invalid { faults }) => Err(Problem::invalid_request("/field/scene", &faults)),
+        Err(error) => Err(Failure::from_field(&error, "/field/scene").into()),
+    }
+}
+
+fn estimate(spec: &JobSpec) -> Estimate {
+    let vertices = spec.shrink.lattice.vertices();
+    let per_vertex = match spec.shrink.method {
+        Method::Adaptive => ADAPTIVE_EVALUATIONS,
+        Method::Paper => PAPER_EVALUATIONS,
+    };
+    Estimate { valid: true, vertices, evaluations: (vertices as f64 * per_vertex).round() as u64 }
+}
+
+/// What `POST /v1/jobs` answers with 200.
+#[derive(Serialize, utoipa::ToSchema)]
+#[serde(untagged)]
+pub enum SubmitAnswer {
+    /// The ended job.
+    Job(Box<Job>),
+    /// The estimate.
+    Estimate(Estimate),
+}
+
+/// A request for a job, as it may be sent: only the field is required. [`JobSpec`] is the same with every default filled in.
+#[derive(Serialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct JobRequest {
+    /// What kind of work it is.
+    #[schema(required = false)]
+    kind: crate::job::JobKind,
+    /// The field.
+    field: crate::job::spec::FieldSpec,
+    /// How it is shrunk.
+    #[schema(required = false)]
+    shrink: crate::shrink::ShrinkSpec,
+    /// What is made; `glb`, `preview` and `report` when nothing is said.
+    #[schema(required = false)]
+    outputs: Vec<crate::job::OutputName>,
+    /// Names to find the job by: at most 16.
+    #[schema(required = false)]
+    labels: std::collections::BTreeMap<String, String>,
+}

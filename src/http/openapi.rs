@@ -1,0 +1,82 @@
+//! The description of the service, made from the handlers.
+
+use super::problem::ProblemDocument;
+use axum::Json;
+use utoipa::openapi::content::ContentBuilder;
+use utoipa::openapi::path::Operation;
+use utoipa::openapi::{OpenApi, Ref, RefOr, Response};
+use utoipa::{OpenApi as _, ToSchema as _};
+
+/// The media type of every answer that is not a success.
+const PROBLEM: &str = "application/problem+json";
+
+#[derive(utoipa::OpenApi)]
+#[openapi(
+    info(
+        title = "shrinkd",
+        description = "Signed distance fields in, parameterized surfaces out: a sphere is shrunk onto the zero level set and \
+                       keeps its coordinates as UVs. Every answer that is not a success is a problem document (RFC 9457).",
+        license(name = "MIT OR Apache-2.0", identifier = "MIT OR Apache-2.0"),
+    ),
+    tags(
+        (name = "inputs", description = "files that jobs name by their hash"),
+        (name = "jobs", description = "the life of a job"),
+        (name = "operation", description = "for whoever operates the service"),
+    ),
+    components(schemas(
+        ProblemDocument,
+        crate::job::event::EventKind,
+        crate::job::preview::MeshPreview,
+        crate::job::ProgressView,
+    )),
+)]
+struct Base;
+
+/// The description without its paths.
+pub(super) fn base() -> OpenApi {
+    Base::openapi()
+}
+
+/// Gives every problem its body, and every operation the problems that any of them can have.
+pub(super) fn complete(mut document: OpenApi) -> OpenApi {
+    for item in document.paths.paths.values_mut() {
+        let operations =
+            [&mut item.get, &mut item.head, &mut item.post, &mut item.delete, &mut item.put, &mut item.patch];
+        for operation in operations.into_iter().flatten() {
+            describe_problems(operation);
+        }
+        // the router answers HEAD from GET; both are one operation, which needs an own name in each method
+        if let Some(head) = &mut item.head {
+            head.operation_id = head.operation_id.take().map(|id| format!("{id}_head"));
+        }
+    }
+    document
+}
+
+fn describe_problems(operation: &mut Operation) {
+    let responses = &mut operation.responses.responses;
+    responses
+        .entry("500".to_owned())
+        .or_insert_with(|| RefOr::T(Response::new("the service failed; the log has the cause under the request's id")));
+    for (status, response) in responses {
+        if !status.starts_with(['4', '5']) {
+            continue;
+        }
+        if let RefOr::T(response) = response {
+            let schema = Ref::from_schema_name(ProblemDocument::name());
+            let content = ContentBuilder::new().schema(Some(schema)).build();
+            response.content.entry(PROBLEM.to_owned()).or_insert(RefOr::T(content));
+        }
+    }
+}
+
+/// This description
+#[utoipa::path(
+    get,
+    path = "/openapi.json",
+    tag = "operation",
+    responses((status = 200, description = "OpenAPI 3.1", content_type = "application/json", body = Object))
+)]
+pub async fn openapi_json() -> Json<OpenApi> {
+    Json(super::document())
+}

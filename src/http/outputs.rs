@@ -1,0 +1,112 @@
+//! `GET|HEAD /v1/jobs/{id}/outputs/{name}`: what a job made, with strong tags and ranges.
+
+use super::conditional::{self, Part};
+use super::jobs::job_id;
+use super::{App, Problem, query};
+use crate::blobs::{BlobError, BlobId};
+use crate::job::OutputName;
+use axum::body::Body;
+use axum::extract::{Path, RawQuery, State};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD;
+
+/// What a job made never changes, and may be forgotten: a day in a private cache.
+const CACHE: &str = "private, max-age=86400, immutable";
+
+/// Downloads an output
+#[utoipa::path(
+    method(get, head),
+    path = "/v1/jobs/{id}/outputs/{name}",
+    tag = "jobs",
+    params(
+        ("id" = String, Path, description = "the job"),
+        ("name" = String, Path, description = "`glb`, `surface`, `preview` or `report`"),
+        ("Range" = Option<String>, Header, description = "one range of bytes"),
+        ("If-None-Match" = Option<String>, Header, description = "versions that are there already"),
+        ("If-Range" = Option<String>, Header, description = "the range is of this version"),
+    ),
+    responses(
+        (status = 200, description = "the output", headers(
+            ("ETag", description = "strong: the SHA-256 of the bytes"),
+            ("Repr-Digest", description = "the same as a digest (RFC 9530)"),
+            ("Accept-Ranges", description = "`bytes`")),
+            content((Vec<u8> = "model/gltf-binary"), (Vec<u8> = "application/octet-stream"), (Vec<u8> = "image/png"),
+                (crate::measure::Report = "application/json"))),
+        (status = 206, description = "the range of it", headers(("Content-Range", description = "which bytes"))),
+        (status = 304, description = "it is there already"),
+        (status = 400, description = "a query parameter is unknown"),
+        (status = 404, description = "there is no such job, or it has no such output"),
+        (status = 409, description = "the job has not ended"),
+        (status = 410, description = "the output is no longer kept"),
+        (status = 416, description = "the output has no such bytes", headers(("Content-Range", description = "its size"))),
+    )
+)]
+pub async fn download(
+    State(app): State<App>,
+    Path((id, name)): Path<(String, String)>,
+    RawQuery(raw): RawQuery,
+    method: Method,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    query::parameters(raw.as_deref(), &[], &[])?;
+    let id = job_id(&id)?;
+    let job = app.engine.get(id).await?.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
+    let unknown = || {
+        let detail = format!("the job has no output {name:?}");
+        Problem::not_found("unknown_output", "there is no such output", detail)
+    };
+    let kind = OutputName::from_name(&name).ok_or_else(unknown)?;
+    if !job.state.ended() {
+        let detail = "outputs are there once the job has succeeded";
+        return Err(Problem::conflict("job_not_ended", "the job has not ended", detail).retry_after(1));
+    }
+    let output = job.outputs.iter().find(|o| o.name == name).ok_or_else(unknown)?;
+    let blob = BlobId::from_hex(&output.sha256).ok_or_else(Problem::internal)?;
+    let tag = format!("\"{}\"", output.sha256);
+    let digest = format!("sha-256=:{}:", BASE64_STANDARD.encode(blob.bytes()));
+
+    let mut answer = HeaderMap::new();
+    let mut set = |name: HeaderName, value: &str| -> Result<(), Problem> {
+        answer.insert(name, HeaderValue::from_str(value).map_err(|_| Problem::internal())?);
+        Ok(())
+    };
+    set(header::ETAG, &tag)?;
+    set(HeaderName::from_static("repr-digest"), &digest)?;
+    set(header::ACCEPT_RANGES, "bytes")?;
+    set(header::CACHE_CONTROL, CACHE)?;
+    if conditional::names_tag(&headers, header::IF_NONE_MATCH, &tag) {
+        return Ok((StatusCode::NOT_MODIFIED, answer).into_response());
+    }
+    set(header::CONTENT_TYPE, &output.media_type)?;
+    set(header::CONTENT_DISPOSITION, &format!("inline; filename=\"{id}.{}\"", kind.extension()))?;
+    // a browser must not guess that an output is a page
+    set(header::X_CONTENT_TYPE_OPTIONS, "nosniff")?;
+    let (status, range) = match conditional::part(&headers, &tag, output.bytes) {
+        Part::Whole => (StatusCode::OK, None),
+        Part::Bytes(range) => {
+            set(header::CONTENT_RANGE, &format!("bytes {}-{}/{}", range.start, range.end - 1, output.bytes))?;
+            (StatusCode::PARTIAL_CONTENT, Some(range))
+        }
+        Part::Unsatisfiable => {
+            let detail = format!("the output has {} bytes", output.bytes);
+            let title = "the output has no such bytes";
+            let size = HeaderValue::from_str(&format!("bytes */{}", output.bytes)).map_err(|_| Problem::internal())?;
+            let problem = Problem::new(StatusCode::RANGE_NOT_SATISFIABLE, "range_not_satisfiable", title, detail);
+            return Err(problem.with_header(header::CONTENT_RANGE, size));
+        }
+    };
+    let length = range.as_ref().map_or(output.bytes, |r| r.end - r.start);
+    set(header::CONTENT_LENGTH, &length.to_string())?;
+    let bytes = match app.blobs.stream(blob, range).await {
+        Ok(bytes) => bytes,
+        Err(BlobError::Missing) => {
+            let detail = "the job is remembered, its bytes are not";
+            return Err(Problem::new(StatusCode::GONE, "output_expired", "the output is no longer kept", detail));
+        }
+        Err(error) => return Err(error.into()),
+    };
+    let body = if method == Method::HEAD { Body::empty() } else { Body::from_stream(bytes) };
+    Ok((status, answer, body).into_response())
+}

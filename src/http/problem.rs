@@ -1,0 +1,215 @@
+//! Problem documents (RFC 9457): every answer that is not a success, and the one place that maps errors to them.
+//!
+//! Handlers return a [`Problem`]; the request's middleware writes it, because only that knows the request's id. Internal
+//! detail goes to the log and never into a problem.
+
+use crate::blobs::BlobError;
+use crate::engine::EngineError;
+use crate::field::Fault;
+use crate::job::Failure;
+use crate::job::failure::{FaultView, TYPE_PREFIX};
+use axum::Json;
+use axum::body::Body;
+use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, Uri, header};
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
+
+/// What went wrong with a request.
+#[derive(Clone, Debug)]
+pub struct Problem {
+    status: StatusCode,
+    code: String,
+    title: String,
+    detail: String,
+    errors: Vec<FaultView>,
+    headers: Vec<(HeaderName, HeaderValue)>,
+}
+
+/// A problem as it is written.
+#[derive(Serialize, utoipa::ToSchema)]
+#[schema(as = Problem)]
+pub struct ProblemDocument {
+    /// Stable name of the problem type: `urn:shrinkd:problem:` and the code.
+    #[serde(rename = "type")]
+    kind: String,
+    /// What kind of problem it is, the same for every occurrence.
+    title: String,
+    /// The HTTP status.
+    status: u16,
+    /// The last part of the type.
+    code: String,
+    /// What is wrong this time.
+    detail: String,
+    /// The request's id, as in the log and in the header `x-request-id`.
+    request_id: String,
+    /// Faults by place, for a request that was understood and is wrong.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    errors: Vec<FaultView>,
+}
+
+impl Problem {
+    /// A problem with a code (stable, part of its type) and a title.
+    pub fn new(status: StatusCode, code: &str, title: &str, detail: impl Into<String>) -> Self {
+        let (code, title, detail) = (code.to_owned(), title.to_owned(), detail.into());
+        Self { status, code, title, detail, errors: Vec::new(), headers: Vec::new() }
+    }
+
+    /// The same problem with a header.
+    pub fn with_header(mut self, name: HeaderName, value: impl Into<HeaderValue>) -> Self {
+        self.headers.push((name, value.into()));
+        self
+    }
+
+    /// The same problem, with a hint when to try again.
+    pub fn retry_after(self, seconds: u32) -> Self {
+        self.with_header(header::RETRY_AFTER, seconds)
+    }
+
+    /// The stable code.
+    pub fn code(&self) -> &str {
+        &self.code
+    }
+    /// What is wrong this time.
+    pub fn detail(&self) -> &str {
+        &self.detail
+    }
+
+    /// 400: the request breaks a syntax.
+    pub fn bad_request(code: &str, title: &str, detail: impl Into<String>) -> Self {
+        Self::new(StatusCode::BAD_REQUEST, code, title, detail)
+    }
+    /// 400: a query parameter is wrong.
+    pub fn query(detail: impl Into<String>) -> Self {
+        Self::bad_request("invalid_query", "a query parameter is invalid", detail)
+    }
+    /// 400: a header is wrong.
+    pub fn header(detail: impl Into<String>) -> Self {
+        Self::bad_request("invalid_header", "a header is invalid", detail)
+    }
+    /// 404: there is no such thing.
+    pub fn not_found(code: &str, title: &str, detail: impl Into<String>) -> Self {
+        Self::new(StatusCode::NOT_FOUND, code, title, detail)
+    }
+    /// 404: there is no such job.
+    pub fn unknown_job(id: &str) -> Self {
+        Self::not_found("unknown_job", "there is no such job", format!("no job {id:?} is known"))
+    }
+    /// 409: not in this state.
+    pub fn conflict(code: &str, title: &str, detail: impl Into<String>) -> Self {
+        Self::new(StatusCode::CONFLICT, code, title, detail)
+    }
+    /// 413: too large.
+    pub fn too_large(limit: u64) -> Self {
+        let detail = format!("the body is larger than the {limit} bytes that are allowed here");
+        Self::new(StatusCode::PAYLOAD_TOO_LARGE, "body_too_large", "the body is too large", detail)
+    }
+    /// 422: understood, and wrong; faults are pointed to below `prefix`.
+    pub fn invalid_request(prefix: &str, faults: &[Fault]) -> Self {
+        let detail = match faults {
+            [one] => format!("{} at {:?}", one.detail, format!("{prefix}{}", one.pointer)),
+            many => format!("{} members are wrong", many.len()),
+        };
+        let errors = faults.iter().map(|f| FaultView::below(prefix, f)).collect();
+        Self { errors, ..Self::unprocessable("invalid_request", "the request is invalid", detail) }
+    }
+    /// 422 with another code.
+    pub fn unprocessable(code: &str, title: &str, detail: impl Into<String>) -> Self {
+        Self::new(StatusCode::UNPROCESSABLE_ENTITY, code, title, detail)
+    }
+    /// 500: something inside failed; the log has the cause under the request's id.
+    pub fn internal() -> Self {
+        let detail = "the service failed; the log has the cause under the request's id";
+        Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", "internal error", detail)
+    }
+    /// 503: not now.
+    pub fn unavailable(code: &str, detail: impl Into<String>) -> Self {
+        Self::new(StatusCode::SERVICE_UNAVAILABLE, code, "the service is not available now", detail).retry_after(5)
+    }
+
+    /// The problem behind a bare status, such as a rejection by the framework.
+    pub fn from_status(status: StatusCode) -> Self {
+        match status {
+            StatusCode::INTERNAL_SERVER_ERROR => Self::internal(),
+            StatusCode::NOT_FOUND => Self::not_found("not_found", "there is nothing here", "the path leads nowhere"),
+            _ => {
+                let title = status.canonical_reason().unwrap_or("error").to_lowercase();
+                let code = title.replace(|c: char| !c.is_ascii_alphanumeric(), "_");
+                Self::new(status, &code, &title, "the request was refused")
+            }
+        }
+    }
+}
+
+impl IntoResponse for Problem {
+    fn into_response(self) -> Response {
+        let mut response = self.status.into_response();
+        response.extensions_mut().insert(self);
+        response
+    }
+}
+
+/// Writes the document, keeping the headers that the answer had (such as `Allow`).
+pub(super) fn render(problem: &Problem, request_id: &str, response: Response) -> Response {
+    let document = ProblemDocument {
+        kind: format!("{TYPE_PREFIX}{}", problem.code),
+        title: problem.title.clone(),
+        status: problem.status.as_u16(),
+        code: problem.code.clone(),
+        detail: problem.detail.clone(),
+        request_id: request_id.to_owned(),
+        errors: problem.errors.clone(),
+    };
+    let (parts, _) = response.into_parts();
+    let mut headers: HeaderMap = parts.headers;
+    headers.remove(header::CONTENT_LENGTH);
+    for (name, value) in &problem.headers {
+        headers.insert(name, value.clone());
+    }
+    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
+    headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
+    let body: Body = Json(document).into_response().into_body();
+    (problem.status, headers, body).into_response()
+}
+
+/// 404 for a path that is not served.
+pub(super) async fn unknown_route(uri: Uri) -> Problem {
+    Problem::not_found("unknown_route", "there is nothing at this path", format!("no route for {:?}", uri.path()))
+}
+
+/// 405; the framework adds `Allow`.
+pub(super) async fn wrong_method(method: Method, uri: Uri) -> Problem {
+    let detail = format!("{method} is not offered at {:?}", uri.path());
+    Problem::new(StatusCode::METHOD_NOT_ALLOWED, "method_not_allowed", "the method is not offered here", detail)
+}
+
+/// 500 for a handler that panicked.
+pub(super) fn panicked(panic: Box<dyn std::any::Any + Send>) -> Response {
+    let message = panic.downcast_ref::<&str>().map(|s| (*s).to_owned());
+    let message = message.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_default();
+    tracing::error!(panic = message, "a handler panicked");
+    Problem::internal().into_response()
+}
+
+impl From<EngineError> for Problem {
+    fn from(error: EngineError) -> Self {
+        tracing::error!(%error, "the engine failed");
+        match error {
+            EngineError::Stopped => Self::unavailable("stopping", "the service is stopping"),
+            EngineError::Store(_) | EngineError::Fenced { .. } => Self::internal(),
+        }
+    }
+}
+
+impl From<BlobError> for Problem {
+    fn from(error: BlobError) -> Self {
+        tracing::error!(%error, "the blob store failed");
+        Self::internal()
+    }
+}
+
+impl From<Failure> for Problem {
+    fn from(failure: Failure) -> Self {
+        let problem = Self::unprocessable(&failure.code, &failure.title, failure.detail);
+        Self { errors: failure.errors, ..problem }
+    }
+}

@@ -1,0 +1,101 @@
+//! The front while it shrinks, small enough to be streamed: positions quantized to 16 bits per coordinate.
+
+use crate::settings::Front;
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD;
+use serde::{Deserialize, Serialize};
+
+/// Body of a `mesh` event.
+///
+/// `positions` is base64 of `vertices` x 3 unsigned 16-bit little-endian integers q; the coordinate along an axis is
+/// `origin + q * step`. `triangles` is base64 of `faces` x 3 unsigned little-endian integers of `index_bytes` bytes each.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct MeshPreview {
+    /// Number of vertices.
+    pub vertices: u32,
+    /// Number of triangles.
+    pub faces: u32,
+    /// Position of the smallest quantized value, scene units.
+    pub origin: [f32; 3],
+    /// Scene units per quantization step, by axis.
+    pub step: [f32; 3],
+    /// Base64 of the quantized positions.
+    pub positions: String,
+    /// Base64 of the triangles.
+    pub triangles: String,
+    /// Bytes of one index: 2 for at most 65,536 vertices, else 4.
+    pub index_bytes: u8,
+}
+
+impl MeshPreview {
+    /// Quantizes a front over its bounding box. Nothing to show (no vertex, or a coordinate that is not finite) is `None`.
+    pub fn new(front: &Front) -> Option<Self> {
+        if front.positions.is_empty() || !front.positions.iter().flatten().all(|c| c.is_finite()) {
+            return None;
+        }
+        let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
+        for p in &front.positions {
+            for axis in 0..3 {
+                low[axis] = low[axis].min(p[axis]);
+                high[axis] = high[axis].max(p[axis]);
+            }
+        }
+        let step: [f32; 3] = std::array::from_fn(|axis| (high[axis] - low[axis]) / f32::from(u16::MAX));
+        let quantize = |c: f32, axis: usize| -> u16 {
+            if step[axis] > 0.0 {
+                ((c - low[axis]) / step[axis]).round().clamp(0.0, f32::from(u16::MAX)) as u16
+            } else {
+                0
+            }
+        };
+        let mut positions = Vec::with_capacity(6 * front.positions.len());
+        for p in &front.positions {
+            for axis in 0..3 {
+                positions.extend_from_slice(&quantize(p[axis], axis).to_le_bytes());
+            }
+        }
+        let index_bytes: u8 = if front.positions.len() <= 1 << 16 { 2 } else { 4 };
+        let mut triangles = Vec::with_capacity(3 * usize::from(index_bytes) * front.triangles.len());
+        for corner in front.triangles.iter().flatten() {
+            triangles.extend_from_slice(&corner.to_le_bytes()[..usize::from(index_bytes)]);
+        }
+        Some(Self {
+            vertices: front.positions.len() as u32,
+            faces: front.triangles.len() as u32,
+            origin: low,
+            step,
+            positions: BASE64_STANDARD.encode(positions),
+            triangles: BASE64_STANDARD.encode(triangles),
+            index_bytes,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_decoded_preview_is_within_half_a_step_of_the_front() {
+        let front = Front {
+            positions: vec![[0.0, -1.0, 5.0], [0.25, 2.0, 5.0], [1.0, 0.3333, 5.0]],
+            triangles: vec![[0, 1, 2]],
+        };
+        let preview = MeshPreview::new(&front).expect("finite");
+        let bytes = BASE64_STANDARD.decode(&preview.positions).expect("base64");
+        for (v, p) in front.positions.iter().enumerate() {
+            for axis in 0..3 {
+                let k = 2 * (3 * v + axis);
+                let q = u16::from_le_bytes([bytes[k], bytes[k + 1]]);
+                let c = preview.origin[axis] + f32::from(q) * preview.step[axis];
+                assert!((c - p[axis]).abs() <= 0.51 * preview.step[axis] + 1e-6, "{c} for {}", p[axis]);
+            }
+        }
+        assert_eq!(BASE64_STANDARD.decode(&preview.triangles).expect("base64"), [0, 0, 1, 0, 2, 0]);
+    }
+
+    #[test]
+    fn a_front_that_blew_up_is_not_shown() {
+        assert_eq!(MeshPreview::new(&Front { positions: vec![[f32::NAN; 3]], triangles: vec![] }), None);
+    }
+}

@@ -1,0 +1,346 @@
+//! The worker: claims jobs, runs them on the rayon pool, tells their news, and ends them.
+//!
+//! Computing happens on blocking threads and on the pool, never on the async runtime. A worker takes exactly as many jobs as
+//! it has free slots, renews each claim every third of its lease, and stops a computation within a heartbeat of losing it.
+
+use super::failure::{Ended, Failure};
+use super::preview::MeshPreview;
+use super::{EventKind, Output, OutputName, ProgressView, pipeline};
+use crate::blobs::{BlobError, Blobs};
+use crate::engine::{Claim, Engine, EngineError, Outcome, Renewal, Update};
+use crate::settings::{CancelToken, Progress, Settings};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+use tracing::Instrument as _;
+
+/// Least time between two progress events of a job.
+const PROGRESS_EVERY: Duration = Duration::from_millis(100);
+/// Least time between two mesh events of a job.
+const MESH_EVERY: Duration = Duration::from_millis(250);
+/// How long a worker that found nothing to do waits before it asks again; a new job wakes it at once.
+const CLAIM_WAIT: Duration = Duration::from_secs(20);
+/// Pause after the engine failed, so that a broken disk does not make a busy loop.
+const BACKOFF: Duration = Duration::from_secs(1);
+/// How often the end of a job is tried to be written before it is left to the next attempt.
+const FINISH_TRIES: u32 = 5;
+/// Time that running jobs get to come to their end once the service stops.
+pub const GRACE: Duration = Duration::from_secs(2);
+
+/// What a worker works with.
+pub struct Worker {
+    /// Where jobs come from.
+    pub engine: Arc<dyn Engine>,
+    /// Where bytes lie.
+    pub blobs: Blobs,
+    /// The pool that all jobs share.
+    pub pool: Arc<rayon::ThreadPool>,
+    /// Jobs at once.
+    pub slots: usize,
+    /// Name of this worker, different for every process.
+    pub name: String,
+}
+
+impl Worker {
+    /// Works until `stop` is raised; then gives running jobs [`GRACE`] to end, and gives the rest back.
+    pub async fn run(self, stop: CancellationToken) {
+        let worker = Arc::new(self);
+        let slots = Arc::new(tokio::sync::Semaphore::new(worker.slots));
+        let (jobs, give_back) = (TaskTracker::new(), CancellationToken::new());
+        loop {
+            // pull exactly the number of free slots: a job that waits in a worker is a job that another could run
+            let free = tokio::select! {
+                () = stop.cancelled() => break,
+                permit = slots.clone().acquire_owned() => permit.unwrap_or_else(|_| unreachable!("never closed")),
+            };
+            let mut permits = vec![free];
+            while let Ok(more) = slots.clone().try_acquire_owned() {
+                permits.push(more);
+            }
+            let claims = tokio::select! {
+                () = stop.cancelled() => break,
+                claims = worker.claim(permits.len()) => claims,
+            };
+            for (claim, permit) in claims.into_iter().zip(permits) {
+                let (worker, give_back) = (worker.clone(), give_back.clone());
+                let span = tracing::info_span!("job", job.id = %claim.id, job.attempt = claim.attempt);
+                jobs.spawn(
+                    async move {
+                        worker.attempt(claim, give_back).await;
+                        drop(permit);
+                    }
+                    .instrument(span),
+                );
+            }
+        }
+        jobs.close();
+        if tokio::time::timeout(GRACE, jobs.wait()).await.is_err() {
+            tracing::info!(jobs = jobs.len(), "running jobs are given back to the queue");
+            give_back.cancel();
+            jobs.wait().await;
+        }
+    }
+
+    async fn claim(&self, slots: usize) -> Vec<Claim> {
+        match self.engine.claim(&self.name, slots, CLAIM_WAIT).await {
+            Ok(claims) => claims,
+            Err(error) => {
+                tracing::error!(%error, "no job could be claimed");
+                tokio::time::sleep(BACKOFF).await;
+                Vec::new()
+            }
+        }
+    }
+
+    /// Runs one attempt from claim to end.
+    async fn attempt(&self, claim: Claim, give_back: CancellationToken) {
+        tracing::info!("job started");
+        let cancel = CancelToken::new();
+        let (news, mut inbox) = mpsc::unbounded_channel();
+        let mut work = tokio::spawn(self.work(claim.clone(), cancel.clone(), news).in_current_span());
+        let interrupted = self.engine.interrupted(&claim);
+        tokio::pin!(interrupted);
+        let beat = claim.lease / 3;
+        let mut heartbeat = tokio::time::interval_at(tokio::time::Instant::now() + beat, beat);
+        let (mut lost, mut watching, mut returning) = (false, true, false);
+        let result = loop {
+            tokio::select! {
+                // what was told before the end is stored before the end
+                biased;
+                Some(update) = inbox.recv() => {
+                    let mut updates = vec![update];
+                    while let Ok(more) = inbox.try_recv() {
+                        updates.push(more);
+                    }
+                    lost |= self.renew(&claim, updates).await == Renewal::Lost;
+                }
+                result = &mut work => break result,
+                interruption = &mut interrupted, if watching => {
+                    watching = false;
+                    lost |= interruption == Renewal::Lost;
+                    cancel.cancel();
+                }
+                () = give_back.cancelled(), if !returning => {
+                    returning = true;
+                    cancel.cancel();
+                }
+                _ = heartbeat.tick() => lost |= self.renew(&claim, Vec::new()).await == Renewal::Lost,
+            }
+            if lost {
+                cancel.cancel();
+            }
+        };
+        let result = result.unwrap_or_else(|panic| {
+            tracing::error!(%panic, "the job panicked");
+            Err(Ended::Failed(Failure::internal()))
+        });
+        if lost {
+            tracing::warn!("the claim was lost; nothing of this attempt counts");
+            return;
+        }
+        // nothing that a record names may be removed from here until the record names it
+        let promise = self.blobs.promise().await;
+        let outcome = match result {
+            Ok(made) => self.store(&claim, made).await,
+            Err(Ended::Failed(failure)) => Outcome::Failed(failure),
+            Err(Ended::Canceled) if returning => Outcome::Released,
+            Err(Ended::Canceled) => Outcome::Canceled,
+        };
+        self.end(&claim, outcome).await;
+        drop(promise);
+    }
+
+    async fn renew(&self, claim: &Claim, updates: Vec<Update>) -> Renewal {
+        self.engine.renew(claim, updates).await.unwrap_or_else(|error| {
+            // the lease may still hold; when it does not, the fence does
+            tracing::error!(%error, "a claim could not be renewed");
+            Renewal::Keep
+        })
+    }
+
+    /// Reads the input and computes, off the async runtime.
+    fn work(
+        &self,
+        claim: Claim,
+        cancel: CancelToken,
+        news: mpsc::UnboundedSender<Update>,
+    ) -> impl Future<Output = Result<pipeline::Made, Ended>> + Send + use<> {
+        let (blobs, pool) = (self.blobs.clone(), self.pool.clone());
+        async move {
+            let clock = Instant::now();
+            let input = match claim.spec.field.input {
+                None => None,
+                Some(id) => match blobs.get(id).await {
+                    Ok(bytes) => Some(bytes),
+                    Err(BlobError::Missing) => {
+                        let detail = format!("no input {id} is stored");
+                        return Err(Failure::new("unknown_input", "the input is not there", detail).into());
+                    }
+                    Err(error) => {
+                        tracing::error!(%error, "the input could not be read");
+                        return Err(Failure::internal().into());
+                    }
+                },
+            };
+            let span = tracing::Span::current();
+            let compute = move || {
+                let _entered = span.enter();
+                let opened = pipeline::open(&claim.spec.field, input.as_deref(), "/field")?;
+                cancel.check()?;
+                let teller = Teller::new(news);
+                let progress = |progress: Progress| teller.tell(progress);
+                let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress };
+                let load = clock.elapsed().as_secs_f64();
+                pipeline::make(&opened, &claim.spec.shrink, &claim.spec.outputs, load, settings)
+            };
+            tokio::task::spawn_blocking(compute).await.unwrap_or_else(|panic| {
+                tracing::error!(%panic, "the computation panicked");
+                Err(Failure::internal().into())
+            })
+        }
+    }
+
+    /// Stores the outputs; they are durable before the outcome that names them is told.
+    async fn store(&self, claim: &Claim, made: pipeline::Made) -> Outcome {
+        let mut outputs = Vec::new();
+        for (name, bytes) in made.files {
+            let size = bytes.len() as u64;
+            match self.blobs.put(bytes.into()).await {
+                Ok(id) => outputs.push(Output {
+                    name: name.name().to_owned(),
+                    href: output_href(claim, name),
+                    media_type: name.media_type().to_owned(),
+                    bytes: size,
+                    sha256: id.hex(),
+                }),
+                Err(error) => {
+                    tracing::error!(%error, output = name.name(), "an output could not be stored");
+                    return Outcome::Failed(Failure::internal());
+                }
+            }
+        }
+        let metrics = serde_json::to_value(&made.report).unwrap_or_default();
+        Outcome::Succeeded { outputs, metrics }
+    }
+
+    async fn end(&self, claim: &Claim, outcome: Outcome) {
+        for _ in 0..FINISH_TRIES {
+            match self.engine.finish(claim, outcome.clone()).await {
+                Ok(()) => {
+                    let (ended, code) = match &outcome {
+                        Outcome::Succeeded { .. } => ("succeeded", ""),
+                        Outcome::Failed(failure) => ("failed", failure.code.as_str()),
+                        Outcome::Canceled => ("canceled", ""),
+                        Outcome::Released => ("released", ""),
+                    };
+                    tracing::info!(job.outcome = ended, problem.code = code, "job ended");
+                    return;
+                }
+                Err(EngineError::Fenced { .. }) => {
+                    tracing::warn!("the claim was lost at the end; nothing of this attempt counts");
+                    return;
+                }
+                Err(error) => {
+                    tracing::error!(%error, "the end of the job could not be written");
+                    tokio::time::sleep(BACKOFF).await;
+                }
+            }
+        }
+    }
+}
+
+fn output_href(claim: &Claim, name: OutputName) -> String {
+    format!("/v1/jobs/{}/outputs/{}", claim.id, name.name())
+}
+
+/// Turns the computation's progress into news, no more often than anyone can look.
+struct Teller {
+    news: mpsc::UnboundedSender<Update>,
+    started: Instant,
+    last: Mutex<Last>,
+}
+
+#[derive(Default)]
+struct Last {
+    stage: &'static str,
+    progress: Option<Instant>,
+    mesh: Option<Instant>,
+}
+
+impl Teller {
+    fn new(news: mpsc::UnboundedSender<Update>) -> Self {
+        Self { news, started: Instant::now(), last: Mutex::default() }
+    }
+
+    fn tell(&self, progress: Progress) {
+        let now = Instant::now();
+        let due = |last: Option<Instant>, every| last.is_none_or(|last: Instant| now.duration_since(last) >= every);
+        let mut last = self.last.lock().unwrap_or_else(|e| e.into_inner());
+        if due(last.progress, PROGRESS_EVERY) || progress.stage != last.stage {
+            last.stage = progress.stage;
+            last.progress = Some(now);
+            let view = view(&progress, self.started.elapsed());
+            let data = serde_json::to_value(&view).unwrap_or_default();
+            // nobody listens any more once the claim is lost
+            let _ = self.news.send(Update { kind: EventKind::Progress, data, progress: Some(view) });
+        }
+        if due(last.mesh, MESH_EVERY)
+            && let Some(preview) = progress.front.as_ref().and_then(MeshPreview::new)
+        {
+            last.mesh = Some(now);
+            let data = serde_json::to_value(preview).unwrap_or_default();
+            let _ = self.news.send(Update { kind: EventKind::Mesh, data, progress: None });
+        }
+    }
+}
+
+/// Progress as clients see it. The rest is judged to go at the pace so far, once a tenth is done.
+fn view(progress: &Progress, elapsed: Duration) -> ProgressView {
+    let fraction = if progress.fraction.is_finite() { progress.fraction.clamp(0.0, 1.0) } else { 0.0 };
+    let done = f64::from(fraction);
+    ProgressView {
+        stage: progress.stage.to_owned(),
+        iteration: progress.iteration,
+        iterations: progress.iterations,
+        fraction,
+        energy: progress.energy.filter(|e| e.is_finite()),
+        max_distance: progress.max_distance.filter(|d| d.is_finite()),
+        flips: progress.flips,
+        eta_s: (done >= 0.1).then(|| elapsed.as_secs_f64() * (1.0 - done) / done),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn news_are_told_at_a_pace_that_can_be_followed() {
+        let (news, mut inbox) = mpsc::unbounded_channel();
+        let teller = Teller::new(news);
+        let front = crate::settings::Front { positions: vec![[0.0; 3]; 3], triangles: vec![[0, 1, 2]] };
+        for iteration in 0..1000 {
+            teller.tell(Progress { stage: "contract", iteration, front: Some(front.clone()), ..Progress::default() });
+        }
+        let elapsed = teller.started.elapsed();
+        drop(teller);
+        let mut told = [0u32; 2];
+        while let Ok(update) = inbox.try_recv() {
+            told[usize::from(update.kind == EventKind::Mesh)] += 1;
+        }
+        assert!(
+            told[0] <= 1 + elapsed.as_millis() as u32 / 100 && told[1] <= 1 + elapsed.as_millis() as u32 / 250,
+            "{told:?}"
+        );
+        assert!(told[0] >= 1 && told[1] >= 1);
+    }
+
+    #[test]
+    fn figures_that_are_not_finite_are_left_out() {
+        let view =
+            view(&Progress { fraction: f32::NAN, energy: Some(f64::NAN), ..Progress::default() }, Duration::ZERO);
+        assert_eq!((view.fraction, view.energy, view.eta_s), (0.0, None, None));
+    }
+}

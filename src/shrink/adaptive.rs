@@ -1,0 +1,132 @@
+//! `method: adaptive`: contract, remesh, map, resample, untangle; again and finer where the result is folded.
+
+use super::base::base;
+use super::contract::{Resolution, contract};
+use super::creases::{choose_diagonals, snap};
+use super::density::density;
+use super::lattice::SphereLattice;
+use super::resample::{land, orient};
+use super::sphere_map::sphere_map;
+use super::unfold::Corners;
+use super::untangle::Tangle;
+use super::zero::{OnZero, project};
+use super::{ShrinkError, ShrinkSpec, Wrap};
+use crate::field::Sampler;
+use crate::settings::{Front, Progress};
+use glam::DVec3;
+
+/// Weight of area against angle in the sphere map.
+const BETA: f64 = 0.5;
+
+/// What one attempt works with.
+struct Attempt {
+    resolution: Resolution,
+    /// Base vertices for a lattice of the default size.
+    base_vertices: usize,
+    /// Where its share of the progress starts and ends.
+    share: (f32, f32),
+}
+
+const ATTEMPTS: [Attempt; 3] = [
+    Attempt { resolution: Resolution { levels: 3, probe: true }, base_vertices: 10_000, share: (0.0, 0.7) },
+    Attempt { resolution: Resolution { levels: 4, probe: true }, base_vertices: 20_000, share: (0.7, 0.9) },
+    Attempt { resolution: Resolution { levels: 4, probe: false }, base_vertices: 20_000, share: (0.9, 1.0) },
+];
+
+/// Runs attempts until one has no fold; the one with the fewest is returned when none has.
+pub fn run(sampler: &Sampler<'_>, spec: &ShrinkSpec) -> Result<Wrap, ShrinkError> {
+    let lattice = SphereLattice::new(spec.lattice);
+    let mut best: Option<(usize, Wrap)> = None;
+    let mut refusal = None;
+    for attempt in &ATTEMPTS {
+        match one(sampler, &lattice, attempt) {
+            Ok((folds, wrap)) => {
+                if best.as_ref().is_none_or(|b| folds < b.0) {
+                    best = Some((folds, wrap));
+                }
+                if folds == 0 {
+                    break;
+                }
+            }
+            Err(ShrinkError::Canceled(c)) => return Err(c.into()),
+            // a finer lattice may see a gap or a wall that this one did not
+            Err(e @ (ShrinkError::Components { .. } | ShrinkError::Genus { .. })) => refusal = Some(e),
+            Err(e) => return Err(e),
+        }
+    }
+    match (best, refusal) {
+        (Some((_, wrap)), _) => Ok(wrap),
+        (None, Some(e)) => Err(e),
+        (None, None) => unreachable!("every attempt gives a wrap or an error"),
+    }
+}
+
+fn one(scene: &Sampler<'_>, lattice: &SphereLattice, attempt: &Attempt) -> Result<(usize, Wrap), ShrinkError> {
+    let settings = *scene.settings();
+    let (start, end) = attempt.share;
+    let stage = |name: &'static str, done: f32, front: Option<Front>, energy: Option<f64>, flips: Option<u64>| {
+        scene.tally().stage(name);
+        (settings.progress)(Progress {
+            stage: name,
+            fraction: start + (end - start) * done,
+            front,
+            energy,
+            flips,
+            ..Progress::default()
+        });
+    };
+    stage("contract", 0.0, None, None, None);
+    let front = contract(scene, attempt.resolution)?;
+    let frame = front.frame;
+    let show = |positions: &[DVec3], triangles: Vec<[u32; 3]>| Front {
+        positions: positions.iter().map(|&p| frame.to_scene(p).as_vec3().to_array()).collect(),
+        triangles,
+    };
+    stage("remesh", 0.25, None, None, None);
+    let sampler = scene.framed(frame);
+    let (mesh, folded) = base(front, attempt.base_vertices, &sampler)?;
+    stage("map", 0.45, Some(show(&mesh.positions, mesh.rings.triangles())), None, Some(folded as u64));
+    let map = sphere_map(&mesh, &density(&mesh), BETA, settings.cancel)?.ok_or(ShrinkError::Unmapped)?;
+    stage("resample", 0.75, None, Some(map.energy), None);
+    let directions = orient(&mesh, &map.directions, lattice.spec);
+    let landed = land(&mesh, &directions, lattice);
+    settings.cancel.check()?;
+    let edge = (mesh.area() / lattice.directions.len() as f64).sqrt();
+    let mut at = project(&sampler, landed.clone(), edge, 1e-3 * edge)?;
+    stage("untangle", 0.85, None, None, None);
+    let diagonals = choose_diagonals(&sampler, lattice, &at)?;
+    let triangles = lattice.triangles(&diagonals);
+    let tangle = Tangle::new(&sampler, &triangles, &at.positions);
+    let mut folds = tangle.relax_patches(&mut at, &landed, 2)?;
+    if folds > 0 {
+        folds = tangle.move_single(&mut at)?;
+    }
+    stage("sharpen", 0.95, Some(show(&at.positions, triangles.clone())), None, Some(folds as u64));
+    let (folds, at, diagonals) = sharpen(&sampler, lattice, (folds, at, diagonals))?;
+    let positions: Vec<DVec3> = at.positions.iter().map(|&p| frame.to_scene(p)).collect();
+    let triangles = lattice.triangles(&diagonals);
+    stage("sharpen", 1.0, Some(show(&at.positions, triangles)), None, Some(folds as u64));
+    Ok((folds, Wrap { lattice: lattice.clone(), positions, diagonals }))
+}
+
+/// Moves vertices onto creases and turns diagonals along them; keeps what it was given where that folds more.
+fn sharpen(
+    sampler: &Sampler<'_>,
+    lattice: &SphereLattice,
+    before: (usize, OnZero, Vec<bool>),
+) -> Result<(usize, OnZero, Vec<bool>), ShrinkError> {
+    let mut at = before.1.clone();
+    let triangles = lattice.triangles(&before.2);
+    let corners = Corners::new(at.positions.len(), &triangles);
+    if snap(sampler, &triangles, &corners, &mut at)? == 0 {
+        return Ok(before);
+    }
+    let diagonals = choose_diagonals(sampler, lattice, &at)?;
+    let triangles = lattice.triangles(&diagonals);
+    let tangle = Tangle::new(sampler, &triangles, &at.positions);
+    let mut folds = tangle.folds(&at)?;
+    if folds > before.0 {
+        folds = tangle.move_single(&mut at)?;
+    }
+    Ok(if folds > before.0 { before } else { (folds, at, diagonals) })
+}

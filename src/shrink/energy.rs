@@ -1,0 +1,90 @@
+//! The distortion energy of one triangle against a reference triangle, and the two-dimensional Newton step both the sphere
+//! map and the untangling take.
+
+use glam::{DMat3, DVec2, DVec3};
+
+/// A reference triangle: its area and the cotangents at its three corners, which give the Dirichlet energy of a map from
+/// it (Pinkall and Polthier 1993).
+#[derive(Clone, Copy, Debug)]
+pub struct Reference {
+    /// Area.
+    pub area: f64,
+    /// Cotangent at each corner.
+    pub cotangents: [f64; 3],
+}
+
+impl Reference {
+    /// From three corners scaled by `scale`; `softening` pulls slivers towards equilateral, relative to the mean squared
+    /// edge.
+    pub fn new(corners: [DVec3; 3], scale: f64, softening: f64) -> Self {
+        let [a, b, c] = corners;
+        let mut l = [(b - c), (c - a), (a - b)].map(|e| e.length_squared() * scale * scale);
+        let mean = (l[0] + l[1] + l[2]) / 3.0;
+        for e in &mut l {
+            *e += softening * mean + 1e-14;
+        }
+        // Heron's formula on squared edges
+        let heron = 2.0 * (l[0] * l[1] + l[1] * l[2] + l[2] * l[0]) - l[0] * l[0] - l[1] * l[1] - l[2] * l[2];
+        let area = 0.25 * heron.max(1e-30).sqrt();
+        let cotangent = |opposite: f64, p: f64, q: f64| (p + q - opposite) / (4.0 * area);
+        Self {
+            area,
+            cotangents: [cotangent(l[0], l[1], l[2]), cotangent(l[1], l[2], l[0]), cotangent(l[2], l[0], l[1])],
+        }
+    }
+
+    /// The equilateral triangle of this edge length.
+    pub fn equilateral(edge: f64) -> Self {
+        Self { area: 3f64.sqrt() / 4.0 * edge * edge, cotangents: [1.0 / 3f64.sqrt(); 3] }
+    }
+
+    /// Dirichlet energy per area: squared Frobenius norm of the Jacobian of the map that takes the reference to `x, b, c`.
+    pub fn dirichlet(&self, x: DVec3, b: DVec3, c: DVec3) -> f64 {
+        let [cx, cb, cc] = self.cotangents;
+        (cc * x.distance_squared(b) + cb * x.distance_squared(c) + cx * b.distance_squared(c)) / (2.0 * self.area)
+    }
+    /// Gradient of [`Reference::dirichlet`] in `x`.
+    pub fn dirichlet_gradient(&self, x: DVec3, b: DVec3, c: DVec3) -> DVec3 {
+        let [_, cb, cc] = self.cotangents;
+        (cc * (x - b) + cb * (x - c)) / self.area
+    }
+    /// The factor of the identity that is the Hessian of [`Reference::dirichlet`] in `x`.
+    pub fn dirichlet_hessian(&self) -> f64 {
+        (self.cotangents[1] + self.cotangents[2]) / self.area
+    }
+}
+
+/// Two unit vectors that complete `n` to a right-handed frame.
+pub fn tangents(n: DVec3) -> (DVec3, DVec3) {
+    let axis = if n.x.abs() < 0.6 { DVec3::X } else { DVec3::Y };
+    let e1 = axis.cross(n).normalize_or(DVec3::X);
+    (e1, n.cross(e1))
+}
+
+/// Newton direction in the plane of `e1, e2` with the Hessian's eigenvalues made positive; `shift` is added to the
+/// Hessian's diagonal (the curvature of a sphere the point stays on).
+pub fn newton_direction(gradient: DVec3, hessian: &DMat3, shift: f64, e1: DVec3, e2: DVec3) -> DVec3 {
+    /// Smallest eigenvalue kept, relative to the largest.
+    const FLOOR: f64 = 1e-3;
+    let (h1, h2) = (*hessian * e1, *hessian * e2);
+    let g = DVec2::new(gradient.dot(e1), gradient.dot(e2));
+    let (a, b, c) = (e1.dot(h1) + shift, e1.dot(h2), e2.dot(h2) + shift);
+    let (mean, radius) = (0.5 * (a + c), (0.25 * (a - c) * (a - c) + b * b).sqrt());
+    let (small, large) = (mean - radius, mean + radius);
+    let floor = FLOOR * small.abs().max(large.abs()) + 1e-300;
+    let axis = if b.abs() > 1e-300 {
+        DVec2::new(large - c, b).normalize_or(DVec2::X)
+    } else if a >= c {
+        DVec2::X
+    } else {
+        DVec2::Y
+    };
+    let across = axis.perp();
+    let step = axis * (-g.dot(axis) / large.abs().max(floor)) + across * (-g.dot(across) / small.abs().max(floor));
+    e1 * step.x + e2 * step.y
+}
+
+/// Adds `weight * u v^T` to `m`.
+pub fn add_outer(m: &mut DMat3, u: DVec3, v: DVec3, weight: f64) {
+    *m += DMat3::from_cols(u * v.x, u * v.y, u * v.z) * weight;
+}
