@@ -11,9 +11,11 @@ mod intersect;
 mod obj;
 mod off;
 mod ply;
+mod sides;
 mod stl;
 mod text;
 mod topology;
+mod tree;
 mod winding;
 
 pub use distance::MeshField;
@@ -199,4 +201,4 @@ fn limit(what: &'static str, found: usize, limit: usize) -> FieldError {
 #[cfg(test)]
 mod readers_tests;
 #[cfg(test)]
-mod tests;
+pub(in crate::field) mod tests;

@@ -1,7 +1,7 @@
 //! Marching cubes, the baseline that every figure is compared with (Lorensen and Cline 1987).
 //!
 //! The table is made by code: in each of the 256 sign patterns the crossings are joined face by face, and on a face whose
-//! diagonals differ the outside corners are kept apart, on both sides of the face alike, so that neighbouring cubes always
+//! diagonals differ each inside corner is cut off by itself, on both sides of the face alike, so that neighbouring cubes always
 //! agree and the surface is closed wherever it does not leave the grid (the defect of the original table is described by
 //! Dürst 1988). Not promised: the topology of the trilinear interpolant inside ambiguous cubes.
 

@@ -9,6 +9,8 @@
 mod contour;
 mod paper;
 mod polyline;
+#[cfg(test)]
+mod tests;
 
 use super::{Method, ShrinkError};
 use crate::field::{Counts, Frame, Sampler};
@@ -153,7 +155,9 @@ pub fn shrink_curve(sampler: &Sampler<'_>, spec: &CurveSpec) -> Result<Curve, Sh
 fn adaptive(sampler: &Sampler<'_>, the_loop: &Loop, count: usize, reach: f64) -> Result<Samples, ShrinkError> {
     let n = the_loop.points.len();
     let mut anchors: Vec<usize> = (0..n).filter(|&i| the_loop.corners[i]).collect();
-    if anchors.len() > count {
+    // half of the samples stay free to be even
+    let most = count / 2;
+    if anchors.len() > most {
         // the sharpest stay
         let sharpness = |i: &usize| {
             let p = |k: usize| the_loop.points[k % n];
@@ -161,7 +165,7 @@ fn adaptive(sampler: &Sampler<'_>, the_loop: &Loop, count: usize, reach: f64) ->
             a.normalize_or_zero().dot(b.normalize_or_zero())
         };
         anchors.sort_by(|a, b| sharpness(a).total_cmp(&sharpness(b)).then(a.cmp(b)));
-        anchors.truncate(count);
+        anchors.truncate(most);
         anchors.sort_unstable();
     }
     let rightmost = |a: &usize, b: &usize| the_loop.points[*a].x.total_cmp(&the_loop.points[*b].x).then(b.cmp(a));

@@ -11,6 +11,9 @@ use glam::DVec3;
 
 /// Triangles whose unit normal times the field's unit gradient is at most this are worked on.
 const DOUBTFUL: f64 = 0.1;
+/// Triangles at most this far from opposing the field count as folded: a triangle across the mouth of a notch is
+/// perpendicular to the gradient, and rounding must not decide about it.
+const FOLD: f64 = 1e-3;
 
 /// The lattice surface while it is untangled.
 pub struct Tangle<'a> {
@@ -35,7 +38,7 @@ impl<'a> Tangle<'a> {
         /// A triangle that agrees this well with each of its corners is not folded, if the corners agree among themselves.
         const SURE: f64 = 0.35;
         /// Length of the mean of three unit normals above which they agree.
-        const EVEN: f64 = 0.9;
+        const EVEN: f64 = 0.98;
         let unit: Vec<DVec3> = at.gradients.iter().map(|g| g.normalize_or_zero()).collect();
         let (mut along, mut targets) = (Vec::new(), Vec::new());
         let (mut asked, mut points) = (Vec::new(), Vec::new());
@@ -61,7 +64,7 @@ impl<'a> Tangle<'a> {
 
     /// Number of folded triangles.
     pub fn folds(&self, at: &OnZero) -> Result<usize, Canceled> {
-        Ok(self.agreement(at)?.0.iter().filter(|&&a| a <= 0.0).count())
+        Ok(self.agreement(at)?.0.iter().filter(|&&a| a <= FOLD).count())
     }
 
     /// Relaxes patches around doubtful triangles against the triangles of `landed`, the lattice before it was projected,
@@ -78,7 +81,7 @@ impl<'a> Tangle<'a> {
         let mut best: Option<(usize, OnZero)> = None;
         for round in 0..ROUNDS {
             let (along, mut targets) = self.agreement(at)?;
-            let folded = along.iter().filter(|&&a| a <= 0.0).count();
+            let folded = along.iter().filter(|&&a| a <= FOLD).count();
             if best.as_ref().is_none_or(|b| folded < b.0) {
                 best = Some((folded, at.clone()));
             }
@@ -147,7 +150,7 @@ impl<'a> Tangle<'a> {
         let (mut along, _) = self.agreement(at)?;
         let mut random = Random(0x9e37_79b9_7f4a_7c15);
         for round in 0..ROUNDS {
-            let folded: Vec<usize> = (0..along.len()).filter(|&i| along[i] <= 0.0).collect();
+            let folded: Vec<usize> = (0..along.len()).filter(|&i| along[i] <= FOLD).collect();
             if folded.is_empty() || folded.len() > HOPELESS {
                 break;
             }

@@ -3,7 +3,10 @@
     python3 tests/reference/niq.py NETWORK.npz OUT.npy [COUNT]
 
 Writes an array [COUNT, 7] of float64: a point in the cube of half extent 1, the value there and its gradient, by forward
-mode through every operation. `tests/reference/README.md` says how the Rust tests use it.
+mode through every operation. The Rust tests compare `bunny.npz` with the file that the environment variable
+NIQ_REFERENCE names:
+
+    NIQ_REFERENCE=OUT.npy cargo test --release --lib real_networks
 """
 import sys
 

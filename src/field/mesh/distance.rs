@@ -1,18 +1,20 @@
 //! The exact signed distance to a triangle mesh.
 //!
-//! The nearest triangle comes from parry's bounding-volume hierarchy, the sign from the angle-weighted pseudo-normal of
+//! The nearest triangle comes from a bounding-volume tree, the sign from the angle-weighted pseudo-normal of
 //! the nearest feature (J. A. Baerentzen and H. Aanaes, 2005), which is right for every closed mesh that does not meet
-//! itself. For all other meshes, and where a pseudo-normal is undecided, the generalized winding number decides. All
-//! arithmetic is in `f64` about the center of the mesh; only the given points and the answers are `f32`.
+//! itself. Where a closed mesh meets itself, winding numbers say beforehand what is on the two sides of each patch; near
+//! the places where it meets itself, for a mesh with holes, and where a pseudo-normal is undecided, the winding number of
+//! the point decides. All arithmetic is in `f64` about the center of the mesh; only the given points and the answers are
+//! `f32`.
 
 use super::closest::{Feature, closest};
+use super::sides::{Sides, classify};
 use super::topology::{NONE, Soundness, normals, orient};
+use super::tree::Tree;
 use super::winding::Winding;
 use super::{MAX_TRIANGLES, MAX_VERTICES, TriangleMesh, intersect, limit, malformed};
 use crate::field::{Domain, Field, FieldError, Gradients, Metric, Points};
 use glam::DVec3;
-use parry3d_f64::bounding_volume::Aabb;
-use parry3d_f64::partitioning::{Bvh, BvhBuildStrategy, BvhLeafCost};
 use std::sync::OnceLock;
 
 /// The domain is the bounding box grown on each side by this share of its longest side: room for the start of a front.
@@ -34,10 +36,17 @@ pub struct MeshField {
     domain: Domain,
     center: DVec3,
     on_surface: f64,
-    bvh: Bvh,
+    tree: Tree,
+    /// In the order of the tree's places.
     triangles: Vec<Triangle>,
+    /// Index in the mesh of the triangle at each of the tree's places.
+    order: Vec<u32>,
     neighbours: Vec<[u32; 3]>,
+    face_normals: Vec<DVec3>,
     vertex_normals: Vec<DVec3>,
+    /// For a closed mesh that meets itself: what is beside its triangles and its vertices.
+    sides: Option<(Vec<Sides>, Vec<Sides>)>,
+    /// Built when first asked: most meshes never ask.
     winding: OnceLock<Winding>,
 }
 
@@ -46,7 +55,6 @@ struct Triangle {
     a: DVec3,
     ab: DVec3,
     ac: DVec3,
-    normal: DVec3,
 }
 
 /// The nearest place found on a leaf.
@@ -56,15 +64,10 @@ struct Nearest {
     feature: Feature,
 }
 
-impl BvhLeafCost for Nearest {
-    fn cost(&self) -> f64 {
-        self.distance2
-    }
-}
-
 impl MeshField {
     /// Prepares the distance to `mesh`. Triangles that disagree with their neighbours are turned, and all of them if the
-    /// enclosed volume is negative; [`MeshField::soundness`] counts them. The domain is the bounding box grown by 12 %
+    /// enclosed volume is negative; [`MeshField::soundness`] counts them. Patches of a mesh that meets itself which lie
+    /// inside the solid are left out of the distance (though not of [`MeshField::mesh`]). The domain is the bounding box grown by 12 %
     /// of its longest side on each side.
     ///
     /// # Errors
@@ -96,32 +99,45 @@ impl MeshField {
         let (neighbours, mut soundness) = orient(&mut mesh);
         let vertices: Vec<DVec3> = mesh.vertices.iter().map(|&v| DVec3::from(v) - center).collect();
         let (face_normals, vertex_normals) = normals(&vertices, &mesh.triangles);
-        let triangles: Vec<Triangle> = mesh
-            .triangles
+        let corners = |triangle: &[u32; 3]| triangle.map(|i| vertices[i as usize]);
+        let meets = intersect::find(&vertices, &mesh.triangles);
+        soundness.self_intersecting = meets.iter().filter(|&&m| m).count() as u64;
+        let winding = OnceLock::new();
+        let sides = if soundness.closed && soundness.self_intersecting > 0 {
+            let winding = winding.get_or_init(|| Winding::new(&vertices, &mesh.triangles));
+            Some(classify(&vertices, &mesh.triangles, &neighbours, &meets, winding))
+        } else {
+            None
+        };
+        // a buried patch bounds nothing, and would be a false zero inside the solid
+        let is_boundary = |triangle: u32| sides.as_ref().is_none_or(|s| s.0[triangle as usize] != Sides::Buried);
+        let mut kept: Vec<u32> = (0..mesh.triangles.len() as u32).filter(|&t| is_boundary(t)).collect();
+        if kept.is_empty() {
+            kept = (0..mesh.triangles.len() as u32).collect();
+        }
+        let (tree, places) = Tree::build(kept.iter().map(|&t| corners(&mesh.triangles[t as usize])));
+        let order: Vec<u32> = places.into_iter().map(|place| kept[place as usize]).collect();
+        let triangles = order
             .iter()
-            .zip(face_normals)
-            .map(|(corners, normal)| {
-                let [a, b, c] = corners.map(|i| vertices[i as usize]);
-                Triangle { a, ab: b - a, ac: c - a, normal }
+            .map(|&triangle| {
+                let [a, b, c] = corners(&mesh.triangles[triangle as usize]);
+                Triangle { a, ab: b - a, ac: c - a }
             })
             .collect();
-        let hulls = mesh.triangles.iter().map(|corners| {
-            let [a, b, c] = corners.map(|i| vertices[i as usize]);
-            Aabb::new(a.min(b).min(c), a.max(b).max(c))
-        });
-        let bvh = Bvh::from_iter(BvhBuildStrategy::Binned, hulls.enumerate());
-        soundness.self_intersecting = intersect::count(&vertices, &mesh.triangles, &bvh);
         let margin = DVec3::splat(MARGIN * longest);
         Ok(Self {
             soundness,
             domain: Domain { min: (low - margin).to_array(), max: (high + margin).to_array() },
             center,
             on_surface: ON_SURFACE * (high - low).length(),
-            bvh,
+            tree,
             triangles,
+            order,
             neighbours,
+            face_normals,
             vertex_normals,
-            winding: OnceLock::new(),
+            sides,
+            winding,
             mesh,
         })
     }
@@ -136,53 +152,57 @@ impl MeshField {
         &self.soundness
     }
 
-    /// The nearest place to `p` (about the center). `near` is any triangle, best one close to `p`: it bounds the search.
+    /// The tree's place of the triangle nearest to `p` (about the center), and the point there. `near` is the place of
+    /// any triangle, best of one close to `p`: it bounds the search.
     fn nearest(&self, p: DVec3, near: u32) -> (u32, Nearest) {
-        let at = |triangle: u32| {
-            let t = &self.triangles[triangle as usize];
+        let at = |place: u32| {
+            let t = &self.triangles[place as usize];
             let (place, feature) = closest(p, t.a, t.ab, t.ac);
             Nearest { distance2: p.distance_squared(place), place, feature }
         };
-        let bound = at(near);
-        if bound.distance2 == 0.0 {
-            return self.first_touching(p).unwrap_or((near, bound));
-        }
-        let found = self.bvh.find_best(
-            bound.distance2 * WIDENED,
-            |node, _| {
-                // the arithmetic of parry's box distance, without its square root
-                (node.mins() - p).max(p - node.maxs()).max(DVec3::ZERO).length_squared()
-            },
-            |triangle, _| Some(at(triangle)),
-        );
-        found.unwrap_or((near, bound))
-    }
-
-    /// The triangle with the smallest index that `p` lies on exactly, whatever triangle the search began with.
-    fn first_touching(&self, p: DVec3) -> Option<(u32, Nearest)> {
-        let place = Aabb::new(p, p);
-        let touching = self.bvh.intersect_aabb(&place).filter(|&i| {
-            let t = &self.triangles[i as usize];
-            closest(p, t.a, t.ab, t.ac).0 == p
+        let bound = at(near).distance2 * WIDENED;
+        let mut found: Option<(u32, Nearest)> = None;
+        self.tree.nearest(p, bound, |place, bound| {
+            let candidate = at(place);
+            let distance2 = candidate.distance2;
+            // the first of equally near ones stays
+            if distance2 < bound || found.is_none() && distance2 <= bound {
+                found = Some((place, candidate));
+            }
+            distance2
         });
-        touching.min().map(|i| {
-            let t = &self.triangles[i as usize];
-            let (place, feature) = closest(p, t.a, t.ab, t.ac);
-            (i, Nearest { distance2: 0.0, place, feature })
-        })
+        found.unwrap_or_else(|| (near, at(near)))
     }
 
     /// The pseudo-normal of a feature; of no certain length.
     fn pseudo_normal(&self, triangle: u32, feature: Feature) -> DVec3 {
         let index = triangle as usize;
         match feature {
-            Feature::Face => self.triangles[index].normal,
+            Feature::Face => self.face_normals[index],
             Feature::Edge(edge) => {
                 let across = self.neighbours[index][usize::from(edge)];
-                let other = if across == NONE { DVec3::ZERO } else { self.triangles[across as usize].normal };
-                self.triangles[index].normal + other
+                let other = if across == NONE { DVec3::ZERO } else { self.face_normals[across as usize] };
+                self.face_normals[index] + other
             }
             Feature::Corner(corner) => self.vertex_normals[self.mesh.triangles[index][usize::from(corner)] as usize],
+        }
+    }
+
+    /// What lies on the two sides of a feature.
+    fn sides(&self, triangle: u32, feature: Feature) -> Sides {
+        if !self.soundness.closed {
+            return Sides::Unknown;
+        }
+        let Some((of_triangles, of_vertices)) = &self.sides else { return Sides::Plain };
+        let index = triangle as usize;
+        match feature {
+            Feature::Face => of_triangles[index],
+            Feature::Edge(edge) => {
+                let across = self.neighbours[index][usize::from(edge)];
+                let both = across != NONE && of_triangles[across as usize] == of_triangles[index];
+                if both { of_triangles[index] } else { Sides::Unknown }
+            }
+            Feature::Corner(corner) => of_vertices[self.mesh.triangles[index][usize::from(corner)] as usize],
         }
     }
 
@@ -195,28 +215,32 @@ impl MeshField {
         winding.number(p).abs() > 0.5
     }
 
-    /// Signed distance and gradient at `p` (in scene units), and the triangle that is nearest.
+    /// Signed distance and gradient at `p` (in scene units), and the tree's place of the nearest triangle.
     fn query(&self, p: DVec3, near: u32) -> (f64, DVec3, u32) {
         let p = p - self.center;
-        let (triangle, nearest) = self.nearest(p, near);
+        let (found, nearest) = self.nearest(p, near);
+        let triangle = self.order[found as usize];
         let away = p - nearest.place;
         let distance = nearest.distance2.sqrt();
         let normal = self.pseudo_normal(triangle, nearest.feature);
         let side = away.dot(normal);
         let decided = side.abs() > UNDECIDED * distance * normal.length();
-        let told_by_normal = distance <= self.on_surface || self.soundness.bounds_a_solid() && decided;
-        let inside = if told_by_normal { side < 0.0 } else { self.wrapped(p) };
+        let sides =
+            if decided || distance <= self.on_surface { self.sides(triangle, nearest.feature) } else { Sides::Unknown };
+        let inside = match sides {
+            Sides::Plain => side < 0.0,
+            Sides::Swapped => side > 0.0,
+            Sides::Buried => true,
+            Sides::Unknown => self.wrapped(p),
+        };
         let sign = if inside { -1.0 } else { 1.0 };
         let gradient = if distance > self.on_surface {
             away * (sign / distance)
         } else {
             // a fold can leave a pseudo-normal of no length; the face's, and at last any direction, stand in
-            normal
-                .try_normalize()
-                .or_else(|| self.triangles[triangle as usize].normal.try_normalize())
-                .unwrap_or(DVec3::Z)
+            normal.try_normalize().or_else(|| self.face_normals[triangle as usize].try_normalize()).unwrap_or(DVec3::Z)
         };
-        (sign * distance, gradient, triangle)
+        (sign * distance, gradient, found)
     }
 }
 
@@ -236,20 +260,20 @@ impl Field for MeshField {
         let mut near = 0;
         for (i, value) in values.iter_mut().enumerate() {
             let p = DVec3::new(f64::from(points.x[i]), f64::from(points.y[i]), f64::from(points.z[i]));
-            let (distance, _, triangle) = self.query(p, near);
+            let (distance, _, found) = self.query(p, near);
             *value = distance as f32;
-            near = triangle;
+            near = found;
         }
     }
     fn gradients(&self, points: Points<'_>, values: &mut [f32], gradients: Gradients<'_>) {
         let mut near = 0;
         for (i, value) in values.iter_mut().enumerate() {
             let p = DVec3::new(f64::from(points.x[i]), f64::from(points.y[i]), f64::from(points.z[i]));
-            let (distance, gradient, triangle) = self.query(p, near);
+            let (distance, gradient, found) = self.query(p, near);
             *value = distance as f32;
             (gradients.x[i], gradients.y[i], gradients.z[i]) =
                 (gradient.x as f32, gradient.y as f32, gradient.z as f32);
-            near = triangle;
+            near = found;
         }
     }
     fn truth(&self) -> Option<&TriangleMesh> {

@@ -5,11 +5,16 @@
 
 use glam::{DVec2, DVec3};
 use parry3d_f64::bounding_volume::Aabb;
-use parry3d_f64::partitioning::Bvh;
+use parry3d_f64::partitioning::{Bvh, BvhBuildStrategy};
 
-/// Number of triangles that meet another one outside the corners they share.
-pub(super) fn count(vertices: &[DVec3], triangles: &[[u32; 3]], bvh: &Bvh) -> u64 {
+/// Which triangles meet another one outside the corners they share.
+pub(super) fn find(vertices: &[DVec3], triangles: &[[u32; 3]]) -> Vec<bool> {
     let places = |t: &[u32; 3]| t.map(|i| vertices[i as usize]);
+    let hulls = triangles.iter().map(|triangle| {
+        let [a, b, c] = places(triangle);
+        Aabb::new(a.min(b).min(c), a.max(b).max(c))
+    });
+    let bvh = Bvh::from_iter(BvhBuildStrategy::Binned, hulls.enumerate());
     let mut meets = vec![false; triangles.len()];
     for (index, triangle) in triangles.iter().enumerate() {
         let [a, b, c] = places(triangle);
@@ -22,7 +27,7 @@ pub(super) fn count(vertices: &[DVec3], triangles: &[[u32; 3]], bvh: &Bvh) -> u6
             }
         }
     }
-    meets.iter().filter(|&&m| m).count() as u64
+    meets
 }
 
 /// Whether two triangles meet outside the corners they share.

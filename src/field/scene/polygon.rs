@@ -164,29 +164,26 @@ impl Polygon {
 }
 
 impl Edge {
-    #[inline(always)]
-    fn parameter(&self, wx: f32, wy: f32) -> f32 {
-        ((wx * self.along[0] + wy * self.along[1]) * self.inverse).clamp(0.0, 1.0)
-    }
-
     fn closer(&self, index: f32, x: &[f32], y: &[f32], best: &mut [f32], nearest: &mut [f32]) {
         let n = best.len();
         let (x, y, nearest) = (&x[..n], &y[..n], &mut nearest[..n]);
+        let Edge { start: [ax, ay], along: [ex, ey], inverse, .. } = *self;
         for i in 0..n {
-            let (wx, wy) = (x[i] - self.start[0], y[i] - self.start[1]);
-            let t = self.parameter(wx, wy);
-            let (dx, dy) = (wx - t * self.along[0], wy - t * self.along[1]);
+            let (wx, wy) = (x[i] - ax, y[i] - ay);
+            #[allow(clippy::manual_clamp)] // `clamp` keeps the loop from becoming vector code
+            let t = ((wx * ex + wy * ey) * inverse).max(0.0).min(1.0);
+            let (dx, dy) = (wx - t * ex, wy - t * ey);
             let d = dx * dx + dy * dy;
             let closer = d < best[i];
-            best[i] = if closer { d } else { best[i] };
             nearest[i] = if closer { index } else { nearest[i] };
+            best[i] = if closer { d } else { best[i] };
         }
     }
 
     /// Signed distance and unit gradient at a point that has this edge as its nearest.
     pub fn distance(&self, x: f32, y: f32) -> Planar {
         let (wx, wy) = (x - self.start[0], y - self.start[1]);
-        let t = self.parameter(wx, wy);
+        let t = (wx * self.along[0] + wy * self.along[1]) * self.inverse;
         let facing = wx * self.normal[0] + wy * self.normal[1];
         if t > 0.0 && t < 1.0 {
             return Planar { value: facing, gradient: self.normal };

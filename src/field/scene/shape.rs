@@ -87,7 +87,8 @@ pub(super) fn capsule(
     radius: f32,
 ) -> Sample {
     let w: [f32; 3] = std::array::from_fn(|k| p[k] - from[k]);
-    let t = (dot(w, along) * inverse).clamp(0.0, 1.0);
+    #[allow(clippy::manual_clamp)] // `clamp` keeps a loop over this from becoming vector code
+    let t = (dot(w, along) * inverse).max(0.0).min(1.0);
     let (length, gradient) = direction(std::array::from_fn(|k| w[k] - t * along[k]), aside);
     Sample { value: length - radius, gradient }
 }

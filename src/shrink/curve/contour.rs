@@ -17,13 +17,17 @@ use std::collections::HashMap;
 const COARSE: usize = 64;
 /// How often the spacing is halved: 512 cells per side at last.
 const LEVELS: usize = 3;
+/// A cell may hold a piece of the zero set when a value at its corners is below this part of what the values vary by over
+/// three cells: a distance varies by at least 3 cells there, and the zero set is at most 0.71 cells from a corner of its cell.
+const NEAR: f64 = 0.5;
 /// Half extent of the lattice; beyond the domain, which ends at 1, so that its border is outside.
 const REACH: f64 = 1.03;
-/// Normals at neighbouring crossings that differ by more than 20 degrees may have a corner between them.
-const CORNER_COSINE: f64 = 0.94;
-/// Normals that are nearly parallel do not tell where their tangents meet.
+/// Normals at neighbouring crossings that differ by more than 8 degrees may have a corner between them.
+const CORNER_COSINE: f64 = 0.99;
+/// Normals that are nearly opposite do not tell where their tangents meet.
 const LEAST_SINE: f64 = 0.1;
-/// A corner is one when the field vanishes there to this part of a cell; otherwise it is a rounding.
+/// A corner is one when the field vanishes there to this part of a cell. On a smooth curve that turns by 8 degrees (0.14) in
+/// a cell the tangents meet 0.14/8 of a cell off the curve, so what passes is no rounding.
 const CORNER_MISS: f64 = 0.01;
 /// Crossings closer than this part of a cell are one.
 const MERGE: f64 = 0.02;
@@ -139,16 +143,19 @@ fn halved(sampler: &Sampler<'_>, coarse: &Grid) -> Result<Grid, Canceled> {
     let mut wanted = vec![false; side * side];
     for cell in 0..cells * cells {
         let (i, j) = (cell % cells, cell / cells);
-        // the cell and its neighbours
-        let (mut least, mut most, mut nearest) = (f64::INFINITY, f64::NEG_INFINITY, f64::INFINITY);
+        // how much the values vary over the cell and its neighbours
+        let (mut least, mut most) = (f64::INFINITY, f64::NEG_INFINITY);
         for b in j.saturating_sub(1)..=(j + 2).min(cells) {
             for a in i.saturating_sub(1)..=(i + 2).min(cells) {
                 let v = coarse.values[b * coarse.side + a];
-                (least, most, nearest) = (least.min(v), most.max(v), nearest.min(v.abs()));
+                (least, most) = (least.min(v), most.max(v));
             }
         }
         let v = |a: usize, b: usize| coarse.values[(j + b) * coarse.side + i + a];
-        let near = nearest <= most - least;
+        let corners = [v(0, 0), v(1, 0), v(0, 1), v(1, 1)];
+        let nearest = corners.into_iter().map(f64::abs).fold(f64::INFINITY, f64::min);
+        let crossed = corners.iter().any(|c| (*c < 0.0) != (corners[0] < 0.0));
+        let near = crossed || nearest <= NEAR * (most - least);
         for (a, b) in [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1), (0, 2), (1, 2), (2, 2)] {
             let node = (2 * j + b) * side + 2 * i + a;
             let (x, y) = (0.5 * a as f64, 0.5 * b as f64);
@@ -278,19 +285,28 @@ fn with_corners(sampler: &Sampler<'_>, raw: Loop, spacing: f64) -> Result<Loop, 
         keep.pop();
     }
     let n = keep.len();
-    // where the tangents at successive crossings meet
-    let mut candidates: Vec<(usize, DVec2, DVec2)> = Vec::new();
-    for k in 0..n {
-        let (i, j) = (keep[k], keep[(k + 1) % n]);
+    // where the tangents at two crossings meet, when they turn enough for a corner between them
+    let meeting = |k: usize, l: usize| -> Option<(DVec2, DVec2)> {
+        let (i, j) = (keep[k % n], keep[l % n]);
         let (p, q, u, v) = (raw.points[i], raw.points[j], raw.normals[i], raw.normals[j]);
         let sine = u.perp_dot(v);
         if u.dot(v) > CORNER_COSINE || sine.abs() < LEAST_SINE {
-            continue;
+            return None;
         }
         let (a, b) = (u.dot(p), v.dot(q));
         let meet = DVec2::new(a * v.y - b * u.y, b * u.x - a * v.x) / sine;
-        if meet.distance(p).max(meet.distance(q)) < 2.0 * spacing {
-            candidates.push((k, meet, (u + v).normalize_or(u)));
+        (meet.distance(p).max(meet.distance(q)) < 2.0 * spacing).then_some((meet, (u + v).normalize_or(u)))
+    };
+    let beside = 5.0 * MERGE * spacing;
+    let direct: Vec<Option<(DVec2, DVec2)>> = (0..n).map(|k| meeting(k, k + 1)).collect();
+    let mut candidates: Vec<(usize, DVec2, DVec2)> = Vec::new();
+    for k in 0..n {
+        // a crossing on top of a corner has a normal from anywhere between its sides': then those on either side decide
+        let hidden = direct[k].is_none() && direct[(k + n - 1) % n].is_none();
+        let around = hidden.then(|| meeting(k + n - 1, k + 1)).flatten();
+        let around = around.filter(|(meet, _)| meet.distance(raw.points[keep[k]]) < beside);
+        if let Some((meet, normal)) = direct[k].or(around) {
+            candidates.push((k, meet, normal));
         }
     }
     let places: Vec<DVec3> = candidates.iter().map(|c| c.1.extend(0.0)).collect();
@@ -315,8 +331,8 @@ fn with_corners(sampler: &Sampler<'_>, raw: Loop, spacing: f64) -> Result<Loop, 
     // crossings on top of a corner would make needless short edges of uncertain direction
     let m = out.points.len();
     let drop = |i: usize| {
-        let beside = |j: usize| out.corners[j] && out.points[j].distance(out.points[i]) < 5.0 * MERGE * spacing;
-        !out.corners[i] && (beside((i + 1) % m) || beside((i + m - 1) % m))
+        let covered = |j: usize| out.corners[j] && out.points[j].distance(out.points[i]) < beside;
+        !out.corners[i] && (covered((i + 1) % m) || covered((i + m - 1) % m))
     };
     let kept: Vec<usize> = (0..m).filter(|&i| !drop(i)).collect();
     Ok(Loop {
