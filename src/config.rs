@@ -139,6 +139,13 @@ mod tests {
     }
 
     #[test]
+    fn the_documented_defaults_are_the_defaults() {
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/shrinkd.toml");
+        let documented: Config = Figment::from(Toml::file_exact(file)).extract().expect("names every setting");
+        assert_eq!(documented, Config::default());
+    }
+
+    #[test]
     fn unknown_names_and_impossible_values_are_refused() {
         let folder = tempfile::tempdir().expect("folder");
         let file = folder.path().join("shrinkd.toml");

@@ -19,11 +19,13 @@ use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
-use tokio::sync::Notify;
+use tokio::sync::{Notify, Semaphore};
 use writer::{Hub, Writer};
 
 /// How long an idempotency key is kept.
 const KEY_LIFETIME_MS: i64 = 24 * 60 * 60 * 1000;
+/// Connections that read at once: more than the disk answers at once, few enough for their page caches.
+const READERS: usize = 8;
 /// How often a worker that waits for a job looks for leases that ran out.
 const SWEEP: Duration = Duration::from_secs(1);
 
@@ -47,6 +49,7 @@ impl Default for Terms {
 pub struct SqliteEngine {
     writer: Writer,
     readers: Arc<Mutex<Vec<Connection>>>,
+    reading: Arc<Semaphore>,
     path: PathBuf,
     hub: Arc<Hub>,
     queued: Arc<Notify>,
@@ -77,8 +80,9 @@ impl SqliteEngine {
             tracing::warn!(jobs = lost, "jobs of an earlier process are taken up again");
         }
         let writer = Writer::start(connection, hub.clone())?;
-        let (readers, queued) = (Arc::default(), Arc::new(Notify::new()));
-        Ok(Self { writer, readers, path, hub, queued, terms, _lock: lock })
+        let (readers, reading) = (Arc::default(), Arc::new(Semaphore::new(READERS)));
+        let queued = Arc::new(Notify::new());
+        Ok(Self { writer, readers, reading, path, hub, queued, terms, _lock: lock })
     }
 
     async fn write<T: Send + 'static>(
@@ -93,7 +97,9 @@ impl SqliteEngine {
         work: impl FnOnce(&Connection) -> rusqlite::Result<T> + Send + 'static,
     ) -> Result<T, EngineError> {
         let (readers, path) = (self.readers.clone(), self.path.clone());
+        let turn = self.reading.clone().acquire_owned().await.map_err(|_| EngineError::Stopped)?;
         let read = tokio::task::spawn_blocking(move || {
+            let _turn = turn;
             let pooled = readers.lock().unwrap_or_else(|e| e.into_inner()).pop();
             let mut connection = match pooled {
                 Some(connection) => connection,
