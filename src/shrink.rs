@@ -4,6 +4,7 @@
 //! resampling; `method: paper` is the literal loop of the paper, the baseline. Both end in a [`Wrap`]: one position per
 //! vertex of a [`SphereLattice`](lattice::SphereLattice).
 
+pub mod curve;
 pub mod lattice;
 
 use crate::field::{Frame, Sampler};
