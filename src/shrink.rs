@@ -57,6 +57,10 @@ pub struct Wrap {
     pub lattice: SphereLattice,
     /// One position per lattice vertex, in scene units.
     pub positions: Vec<DVec3>,
+    /// The field's value at every position, in scene units.
+    pub values: Vec<f64>,
+    /// The field's gradient at every position.
+    pub gradients: Vec<DVec3>,
     /// For every quad of the lattice, whether its other diagonal is taken.
     pub diagonals: Vec<bool>,
 }
