@@ -14,9 +14,12 @@ use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, Uri, he
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 
-/// What went wrong with a request.
+/// What went wrong with a request; small, because every handler may return it.
 #[derive(Clone, Debug)]
-pub struct Problem {
+pub struct Problem(Box<Parts>);
+
+#[derive(Clone, Debug)]
+struct Parts {
     status: StatusCode,
     code: String,
     title: String,
@@ -51,12 +54,17 @@ impl Problem {
     /// A problem with a code (stable, part of its type) and a title.
     pub fn new(status: StatusCode, code: &str, title: &str, detail: impl Into<String>) -> Self {
         let (code, title, detail) = (code.to_owned(), title.to_owned(), detail.into());
-        Self { status, code, title, detail, errors: Vec::new(), headers: Vec::new() }
+        Self(Box::new(Parts { status, code, title, detail, errors: Vec::new(), headers: Vec::new() }))
     }
 
     /// The same problem with a header.
     pub fn with_header(mut self, name: HeaderName, value: impl Into<HeaderValue>) -> Self {
-        self.headers.push((name, value.into()));
+        self.0.headers.push((name, value.into()));
+        self
+    }
+
+    fn with_errors(mut self, errors: Vec<FaultView>) -> Self {
+        self.0.errors = errors;
         self
     }
 
@@ -67,11 +75,11 @@ impl Problem {
 
     /// The stable code.
     pub fn code(&self) -> &str {
-        &self.code
+        &self.0.code
     }
     /// What is wrong this time.
     pub fn detail(&self) -> &str {
-        &self.detail
+        &self.0.detail
     }
 
     /// 400: the request breaks a syntax.
@@ -110,7 +118,7 @@ impl Problem {
             many => format!("{} members are wrong", many.len()),
         };
         let errors = faults.iter().map(|f| FaultView::below(prefix, f)).collect();
-        Self { errors, ..Self::unprocessable("invalid_request", "the request is invalid", detail) }
+        Self::unprocessable("invalid_request", "the request is invalid", detail).with_errors(errors)
     }
     /// 422 with another code.
     pub fn unprocessable(code: &str, title: &str, detail: impl Into<String>) -> Self {
@@ -142,7 +150,7 @@ impl Problem {
 
 impl IntoResponse for Problem {
     fn into_response(self) -> Response {
-        let mut response = self.status.into_response();
+        let mut response = self.0.status.into_response();
         response.extensions_mut().insert(self);
         response
     }
@@ -150,6 +158,7 @@ impl IntoResponse for Problem {
 
 /// Writes the document, keeping the headers that the answer had (such as `Allow`).
 pub(super) fn render(problem: &Problem, request_id: &str, response: Response) -> Response {
+    let problem = problem.0.as_ref();
     let document = ProblemDocument {
         kind: format!("{TYPE_PREFIX}{}", problem.code),
         title: problem.title.clone(),
@@ -209,7 +218,6 @@ impl From<BlobError> for Problem {
 
 impl From<Failure> for Problem {
     fn from(failure: Failure) -> Self {
-        let problem = Self::unprocessable(&failure.code, &failure.title, failure.detail);
-        Self { errors: failure.errors, ..problem }
+        Self::unprocessable(&failure.code, &failure.title, failure.detail).with_errors(failure.errors)
     }
 }

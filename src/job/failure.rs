@@ -112,7 +112,7 @@ pub enum Ended {
     /// The cancel token was raised.
     Canceled,
     /// It failed.
-    Failed(Failure),
+    Failed(Box<Failure>),
 }
 
 impl From<crate::settings::Canceled> for Ended {
@@ -123,6 +123,12 @@ impl From<crate::settings::Canceled> for Ended {
 
 impl From<Failure> for Ended {
     fn from(failure: Failure) -> Self {
+        Ended::Failed(Box::new(failure))
+    }
+}
+
+impl From<Box<Failure>> for Ended {
+    fn from(failure: Box<Failure>) -> Self {
         Ended::Failed(failure)
     }
 }
@@ -130,7 +136,7 @@ impl From<Failure> for Ended {
 impl From<ShrinkError> for Ended {
     fn from(error: ShrinkError) -> Self {
         let detail = error.to_string();
-        Ended::Failed(match error {
+        Ended::from(match error {
             ShrinkError::Canceled(_) => return Ended::Canceled,
             ShrinkError::Empty { .. } => {
                 Failure::new("empty_zero_set", "the field has no zero level set in its domain", detail)

@@ -60,7 +60,7 @@ pub fn describe(bytes: &[u8]) -> Result<Description, FieldError> {
 
 /// Opens the field of a request; `bytes` are those of the input that it names, if it names one. Faults are pointed to
 /// below `at`, the place of the field in the request.
-pub fn open(spec: &FieldSpec, bytes: Option<&[u8]>, at: &str) -> Result<Opened, Failure> {
+pub fn open(spec: &FieldSpec, bytes: Option<&[u8]>, at: &str) -> Result<Opened, Box<Failure>> {
     let scene = match &spec.scene {
         None => None,
         Some(scene) => {
@@ -69,7 +69,7 @@ pub fn open(spec: &FieldSpec, bytes: Option<&[u8]>, at: &str) -> Result<Opened, 
             Some(scene.to_string().into_bytes())
         }
     };
-    let bytes = scene.as_deref().or(bytes).ok_or_else(Failure::internal)?;
+    let bytes = scene.as_deref().or(bytes).ok_or_else(|| Box::new(Failure::internal()))?;
     let field = input::open(bytes, &spec.options).map_err(|e| Failure::from_field(&e, at))?;
     // the bytes of a scene in a request are its JSON without spaces, members in alphabetical order
     let provenance = json!({"sha256": BlobId::of(bytes).hex(), "bytes": bytes.len(), "options": spec.options});

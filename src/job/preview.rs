@@ -50,8 +50,8 @@ impl MeshPreview {
         };
         let mut positions = Vec::with_capacity(6 * front.positions.len());
         for p in &front.positions {
-            for axis in 0..3 {
-                positions.extend_from_slice(&quantize(p[axis], axis).to_le_bytes());
+            for (axis, &c) in p.iter().enumerate() {
+                positions.extend_from_slice(&quantize(c, axis).to_le_bytes());
             }
         }
         let index_bytes: u8 = if front.positions.len() <= 1 << 16 { 2 } else { 4 };
@@ -84,11 +84,11 @@ mod tests {
         let preview = MeshPreview::new(&front).expect("finite");
         let bytes = BASE64_STANDARD.decode(&preview.positions).expect("base64");
         for (v, p) in front.positions.iter().enumerate() {
-            for axis in 0..3 {
+            for (axis, original) in p.iter().enumerate() {
                 let k = 2 * (3 * v + axis);
                 let q = u16::from_le_bytes([bytes[k], bytes[k + 1]]);
                 let c = preview.origin[axis] + f32::from(q) * preview.step[axis];
-                assert!((c - p[axis]).abs() <= 0.51 * preview.step[axis] + 1e-6, "{c} for {}", p[axis]);
+                assert!((c - original).abs() <= 0.51 * preview.step[axis] + 1e-6, "{c} for {original}");
             }
         }
         assert_eq!(BASE64_STANDARD.decode(&preview.triangles).expect("base64"), [0, 0, 1, 0, 2, 0]);

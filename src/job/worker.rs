@@ -134,7 +134,7 @@ impl Worker {
         };
         let result = result.unwrap_or_else(|panic| {
             tracing::error!(%panic, "the job panicked");
-            Err(Ended::Failed(Failure::internal()))
+            Err(Failure::internal().into())
         });
         if lost {
             tracing::warn!("the claim was lost; nothing of this attempt counts");
@@ -144,7 +144,7 @@ impl Worker {
         let promise = self.blobs.promise().await;
         let outcome = match result {
             Ok(made) => self.store(&claim, made).await,
-            Err(Ended::Failed(failure)) => Outcome::Failed(failure),
+            Err(Ended::Failed(failure)) => Outcome::Failed(*failure),
             Err(Ended::Canceled) if returning => Outcome::Released,
             Err(Ended::Canceled) => Outcome::Canceled,
         };

@@ -184,3 +184,8 @@ pub async fn problem(response: Response, status: u16, code: &str) -> Value {
     assert!(body["title"].is_string() && body["detail"].is_string());
     body
 }
+
+/// A file among the fixtures.
+pub fn fixture(name: &str) -> Vec<u8> {
+    std::fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)).expect("reads")
+}

@@ -1,6 +1,6 @@
 //! The whole way: submit, follow, download.
 
-use crate::app::{App, PATIENCE, endless, small, state};
+use crate::app::{App, PATIENCE, endless, fixture, small, state};
 use eventsource_stream::Eventsource;
 use futures::StreamExt;
 use reqwest::{Method, StatusCode};
@@ -153,6 +153,31 @@ async fn an_uploaded_scene_is_described_and_used_by_its_hash() {
     request["field"] = json!({"input": input["id"]});
     let id = app.submit(&request).await;
     assert_eq!(state(&app.ended(&id).await), "succeeded");
+}
+
+#[tokio::test]
+async fn an_uploaded_network_is_described_and_wrapped_for_a_latent_code() {
+    let folder = tempfile::tempdir().expect("folder");
+    let app = App::start(folder.path());
+    let upload = app.request(Method::POST, "/v1/inputs").body(fixture("networks/morph.safetensors")).send();
+    let input: Value = upload.await.expect("an answer").json().await.expect("JSON");
+    let description = &input["description"];
+    assert_eq!((&description["kind"], &description["format"]), (&json!("network"), &json!("safetensors")), "{input}");
+    assert!(description["latent_rows"].as_u64() > Some(0) && description["parameters"].as_u64() > Some(0));
+    let mut request = small();
+    request["field"] = json!({"input": input["id"], "latent_row": 1});
+    let id = app.submit(&request).await;
+    let job = app.ended(&id).await;
+    assert_eq!(state(&job), "succeeded", "{job}");
+
+    request["field"] = json!({"input": input["id"], "latent_row": 1000});
+    let id = app.submit(&request).await;
+    let job = app.ended(&id).await;
+    assert_eq!(
+        (state(&job), &job["problem"]["errors"][0]["pointer"]),
+        ("failed", &json!("/field/latent_row")),
+        "{job}"
+    );
 }
 
 #[tokio::test]

@@ -152,8 +152,8 @@ pub(super) fn change(ctx: &mut Ctx<'_>, id: JobId, change: Change) -> rusqlite::
             change.state.name(),
             finished,
             to_json(change.outputs.as_deref().unwrap_or_default())?,
-            change.metrics.as_ref().map(|v| to_json(v)).transpose()?,
-            change.problem.as_ref().map(|v| to_json(v)).transpose()?,
+            change.metrics.as_ref().map(to_json).transpose()?,
+            change.problem.as_ref().map(to_json).transpose()?,
             keeps_hold,
         ],
     )?;
