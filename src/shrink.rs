@@ -2,7 +2,7 @@
 //!
 //! [`shrink`] is the driver. `method: adaptive` is topology-keeping contraction, remeshing, a bijective sphere map and
 //! resampling; `method: paper` is the literal loop of the paper, the baseline. Both end in a [`Wrap`]: one position per
-//! vertex of a [`SphereLattice`](lattice::SphereLattice).
+//! vertex of a [`SphereLattice`].
 
 mod adaptive;
 mod base;
