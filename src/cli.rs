@@ -4,6 +4,7 @@
 //! could not be wrapped.
 
 pub mod extract;
+pub mod first_job;
 pub mod healthcheck;
 pub mod serve;
 
@@ -60,6 +61,9 @@ pub struct ServeArgs {
     /// Configuration file (TOML)
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
+    /// Wrap this field as a first job, and log where its outputs are
+    #[arg(long = "try", value_name = "FIELD")]
+    pub first: Option<PathBuf>,
 }
 
 /// Arguments of `extract`.

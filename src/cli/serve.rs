@@ -1,6 +1,6 @@
 //! `shrinkd serve`: puts the rooms together and runs them until a signal comes.
 
-use super::{BAD_USAGE, FAILED, ServeArgs, fail};
+use super::{BAD_USAGE, FAILED, ServeArgs, fail, first_job};
 use crate::blobs::Blobs;
 use crate::config::Config;
 use crate::engine::Engine;
@@ -9,6 +9,7 @@ use crate::http::{self, App};
 use crate::job::worker::Worker;
 use crate::telemetry;
 use serde::Serialize;
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
@@ -42,7 +43,7 @@ pub fn run(args: &ServeArgs) -> ExitCode {
         Ok(runtime) => runtime,
         Err(error) => return fail(FAILED, &error),
     };
-    let result = runtime.block_on(serve(config));
+    let result = runtime.block_on(serve(config, args.first.clone()));
     // a computation that did not see its token in time must not hold up the end
     runtime.shutdown_background();
     match result {
@@ -51,7 +52,7 @@ pub fn run(args: &ServeArgs) -> ExitCode {
     }
 }
 
-async fn serve(config: Config) -> Result<(), Box<dyn std::error::Error>> {
+async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std::error::Error>> {
     let terms = Terms { lease: Duration::from_secs(config.worker.lease_s), max_losses: config.worker.max_losses };
     let engine: Arc<dyn Engine> = Arc::new(SqliteEngine::open(&config.data_dir, terms)?);
     let blobs = Blobs::in_folder(&config.data_dir.join("blobs"))?;
@@ -77,10 +78,14 @@ async fn serve(config: Config) -> Result<(), Box<dyn std::error::Error>> {
     let worker = tokio::spawn(worker.run(stop.clone()));
     let app = App { engine, blobs, limits: config.limits.clone(), stop: stop.clone() };
     let router = http::router(app, &config.cors_origins);
+    let routes = router.clone();
     let graceful = axum::serve(listener, router).with_graceful_shutdown(stop.clone().cancelled_owned());
     let server = tokio::spawn(graceful.into_future());
     // the program that started this one may wait for this line
     tracing::info!(http.address = %address, data.dir = %config.data_dir.display(), "listening");
+    if let Some(field) = first {
+        tokio::spawn(first_job::run(routes, address, field));
+    }
 
     tokio::select! {
         _ = terminate.recv() => tracing::info!(signal = "SIGTERM", "stopping"),
