@@ -2,7 +2,7 @@
 //!
 //! [`shrink`] is the driver. `method: adaptive` is topology-keeping contraction, remeshing, a bijective sphere map and
 //! resampling; `method: paper` is the literal loop of the paper, the baseline. Both end in a [`Wrap`]: one position per
-//! vertex of a [`SphereLattice`](lattice::SphereLattice).
+//! vertex of a [`SphereLattice`].
 
 mod adaptive;
 mod base;
@@ -57,6 +57,10 @@ pub struct Wrap {
     pub lattice: SphereLattice,
     /// One position per lattice vertex, in scene units.
     pub positions: Vec<DVec3>,
+    /// The field's value at every position, in scene units.
+    pub values: Vec<f64>,
+    /// The field's gradient at every position.
+    pub gradients: Vec<DVec3>,
     /// For every quad of the lattice, whether its other diagonal is taken.
     pub diagonals: Vec<bool>,
 }

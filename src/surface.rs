@@ -8,8 +8,6 @@ pub mod preview;
 pub mod raster;
 pub mod tensors;
 
-use crate::field::Sampler;
-use crate::settings::Canceled;
 use crate::shrink::Wrap;
 use crate::shrink::lattice::SphereLattice;
 use glam::DVec3;
@@ -34,19 +32,17 @@ pub struct Surface {
 }
 
 impl Surface {
-    /// Evaluates the field at the wrap's vertices. One value with gradient per vertex.
-    pub fn new(wrap: Wrap, sampler: &Sampler<'_>) -> Result<Self, Canceled> {
-        let positions: Vec<[f32; 3]> = wrap.positions.iter().map(|p| p.as_vec3().to_array()).collect();
-        let rounded: Vec<DVec3> = positions.iter().map(|&p| glam::Vec3::from(p).as_dvec3()).collect();
-        let (values, gradients) = sampler.gradients(&rounded)?;
-        Ok(Self {
-            positions,
-            normals: gradients.iter().map(|g| g.normalize_or(DVec3::Z).as_vec3().to_array()).collect(),
-            gradient_norms: gradients.iter().map(|g| g.length() as f32).collect(),
-            values: values.iter().map(|&v| v as f32).collect(),
+    /// Rounds the wrap to single precision. The field was evaluated at the rounded places already: a sampler rounds every
+    /// point that it is asked about.
+    pub fn new(wrap: Wrap) -> Self {
+        Self {
+            positions: wrap.positions.iter().map(|p| p.as_vec3().to_array()).collect(),
+            normals: wrap.gradients.iter().map(|g| g.normalize_or(DVec3::Z).as_vec3().to_array()).collect(),
+            gradient_norms: wrap.gradients.iter().map(|g| g.length() as f32).collect(),
+            values: wrap.values.iter().map(|&v| v as f32).collect(),
             triangles: wrap.lattice.triangles(&wrap.diagonals),
             chart_triangles: wrap.lattice.chart_triangles(&wrap.diagonals),
             lattice: wrap.lattice,
-        })
+        }
     }
 }

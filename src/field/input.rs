@@ -89,7 +89,9 @@ pub fn open(bytes: &[u8], options: &FieldOptions) -> Result<Box<dyn Field>, Fiel
         Format::Scene => {
             faults.extend(options.refuse_network_members("a scene"));
             refuse(faults)?;
-            let on_scene = options.domain.filter(|_| options.transform.is_none());
+            // a fitted domain moves with the scene; one that is given holds for the scene as it was moved
+            let fit = DomainOption::Named(DomainName::Fit);
+            let on_scene = options.domain.filter(|&domain| domain == fit || options.transform.is_none());
             let field = scene_from_slice(bytes, on_scene)?;
             if field.dimension() == 2 && options.transform.is_some_and(|t| !t.stays_in_plane()) {
                 let detail = "a scene of dimension 2 can only be turned and moved in its plane";

@@ -101,7 +101,7 @@ pub fn make(
 
     stage("measure", SHRINK_SHARE);
     let clock = Instant::now();
-    let surface = Surface::new(wrap, &sampler)?;
+    let surface = Surface::new(wrap);
     let mut report = measure::report::measure(&surface, &sampler, &spent, spec)?;
     report.seconds.load = load_seconds;
     report.seconds.shrink = shrink_seconds;

@@ -106,7 +106,8 @@ fn one(scene: &Sampler<'_>, lattice: &SphereLattice, attempt: &Attempt) -> Resul
     let positions: Vec<DVec3> = at.positions.iter().map(|&p| frame.to_scene(p)).collect();
     let triangles = lattice.triangles(&diagonals);
     stage("sharpen", 1.0, Some(show(&at.positions, triangles)), None, Some(folds as u64));
-    Ok((folds, Wrap { lattice: lattice.clone(), positions, diagonals }))
+    let values = at.values.iter().map(|s| s * frame.scale).collect();
+    Ok((folds, Wrap { lattice: lattice.clone(), positions, values, gradients: at.gradients, diagonals }))
 }
 
 /// Moves vertices onto creases and turns diagonals along them; keeps what it was given where that folds more.

@@ -24,6 +24,7 @@ pub fn base(front: Front, vertices: usize, sampler: &Sampler<'_>) -> Result<(Mes
     for round in 0..3 {
         // the front's own staircase may turn freely, later rounds may not
         let (turn, guard) = if round == 0 { (-0.2, -0.5) } else { (0.3, 0.0) };
+        sampler.settings().cancel.check()?;
         remesh(&mut mesh, target, 0.6, turn);
         if round == 0 {
             remesh(&mut mesh, target, 0.6, turn);

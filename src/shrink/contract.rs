@@ -36,10 +36,6 @@ pub struct Front {
     pub mesh: Mesh,
     /// The frame that the front is in: about unit size, centred on the shape.
     pub frame: Frame,
-    /// Spacing of the finest lattice, in frame units.
-    pub h: f64,
-    /// Nodes left inside although the field is positive there: under-resolved places.
-    pub residual: usize,
 }
 
 /// How finely to contract.
@@ -107,19 +103,13 @@ pub fn contract(scene: &Sampler<'_>, resolution: Resolution) -> Result<Front, Sh
     let inside = carve(&grid, &target, settings.cancel)?;
 
     let limit = (OBSTRUCTION * grid.h) as f32;
-    let (mut residual, mut obstructed) = (0, false);
-    for i in 0..grid.len() {
-        if inside[i] && target[i] > 0.0 {
-            residual += 1;
-            obstructed |= target[i] > limit;
-        }
-    }
+    let obstructed = (0..grid.len()).any(|i| inside[i] && target[i] > limit);
     if obstructed {
         topology::explain(&grid, &target, &inside, limit, frame)?;
     }
     let moved: HashMap<usize, DVec3> = thin.into_iter().filter(|&(i, _)| inside[i]).collect();
     let mesh = extract(&grid, &inside, &moved, settings.cancel)?;
-    Ok(Front { mesh, frame, h: grid.h, residual })
+    Ok(Front { mesh, frame })
 }
 
 fn slope_of(sampler: &Sampler<'_>, grid: &Grid3) -> f64 {

@@ -55,10 +55,6 @@ impl Grid3 {
     pub fn len(&self) -> usize {
         self.values.len()
     }
-    /// Whether it has no node.
-    pub fn is_empty(&self) -> bool {
-        self.values.is_empty()
-    }
     /// Coordinates of a node.
     pub fn place(&self, i: usize) -> [usize; 3] {
         [i / (self.nodes[1] * self.nodes[2]), i / self.nodes[2] % self.nodes[1], i % self.nodes[2]]

@@ -177,10 +177,10 @@ fn octahedral(spec: LatticeSpec, n: usize) -> SphereLattice {
     };
     let mut grid = vec![u32::MAX; side * side];
     let mut directions = Vec::with_capacity(4 * n * n + 2);
-    for k in 0..side * side {
+    for (k, vertex) in grid.iter_mut().enumerate() {
         if glued(k) == k {
             let (a, b) = place(k);
-            grid[k] = directions.len() as u32;
+            *vertex = directions.len() as u32;
             directions.push(octahedral_direction(a as f64 / m as f64, b as f64 / m as f64));
         }
     }

@@ -12,6 +12,8 @@ use glam::DVec3;
 const STEP: f64 = 0.2;
 /// Iterations with resampling, then with full steps and none.
 const ITERATIONS: (usize, usize) = (100, 10);
+/// A vertex that comes to rest within this of zero, in half sides of the domain, has found the zero level set.
+const NEAR: f64 = 0.01;
 
 /// Runs the loop on either lattice; on the octahedral one the lines that are resampled are the grid's.
 pub fn run(scene: &Sampler<'_>, spec: &ShrinkSpec) -> Result<Wrap, ShrinkError> {
@@ -53,15 +55,17 @@ pub fn run(scene: &Sampler<'_>, spec: &ShrinkSpec) -> Result<Wrap, ShrinkError> 
             ..Progress::default()
         });
     }
-    if low > 0.0 && !reaches_zero(&sampler, &positions)? {
+    let (values, gradients) = sampler.gradients(&positions)?;
+    if low > 0.0 && values.iter().all(|v| v.abs() > NEAR) {
         return Err(ShrinkError::Empty { min: low * frame.scale, max: high * frame.scale });
     }
-    Ok(Wrap { positions: positions.into_iter().map(|q| frame.to_scene(q)).collect(), diagonals, lattice })
-}
-
-/// Whether any vertex came to rest near the zero level set: within 1 % of the frame.
-fn reaches_zero(sampler: &Sampler<'_>, positions: &[DVec3]) -> Result<bool, ShrinkError> {
-    Ok(sampler.values(positions)?.iter().any(|v| v.abs() < 0.01))
+    Ok(Wrap {
+        positions: positions.into_iter().map(|q| frame.to_scene(q)).collect(),
+        values: values.into_iter().map(|v| v * frame.scale).collect(),
+        gradients,
+        diagonals,
+        lattice,
+    })
 }
 
 /// Spaces the vertices of every row (or every column) evenly by arc length. Rows of the lat-long lattice are closed

@@ -49,10 +49,6 @@ impl Rings {
     pub fn len(&self) -> usize {
         self.rings.len()
     }
-    /// Whether there is no vertex at all.
-    pub fn is_empty(&self) -> bool {
-        self.rings.is_empty()
-    }
     /// Neighbours of `v`, counter-clockwise.
     pub fn ring(&self, v: u32) -> &[u32] {
         &self.rings[v as usize]
@@ -232,12 +228,6 @@ impl Mesh {
     /// Length of an edge.
     pub fn length(&self, a: u32, b: u32) -> f64 {
         self.positions[a as usize].distance(self.positions[b as usize])
-    }
-    /// Euler characteristic of the closed mesh.
-    pub fn euler(&self) -> i64 {
-        let vertices = (0..self.rings.len() as u32).filter(|&v| self.rings.alive(v)).count() as i64;
-        let corners: usize = (0..self.rings.len() as u32).map(|v| self.rings.valence(v)).sum();
-        vertices - corners as i64 / 6
     }
 
     /// Whether `v` may go to `to` without turning any of its triangles by more than acos(`turn`); triangles at `except`

@@ -156,6 +156,33 @@ fn an_activation_takes_the_place_of_the_file_s() {
 }
 
 #[test]
+fn a_scene_takes_its_domain_before_or_after_its_transform() {
+    let sphere = br#"{"sphere": {"radius": 0.5}}"#;
+    let transform = serde_json::json!({"scale": 2.0, "translate": [4, 0, 0]});
+    let open = |json| open(sphere, &options(json)).unwrap();
+    let plain = open(serde_json::json!({"transform": transform}));
+    assert!((at(&*plain, [5.5, 0.0, 0.0]).0 - 0.5).abs() < 1e-6);
+    assert_eq!((plain.domain().min[0], plain.domain().max[0]), (2.0, 6.0));
+    let fitted = open(serde_json::json!({"transform": transform, "domain": "fit"})).domain();
+    assert!(fitted.min[0] > 2.0 && fitted.min[0] < 3.0 && fitted.max[0] > 5.0 && fitted.max[0] < 6.0, "{fitted:?}");
+    let given = serde_json::json!({"min": [2.5, -2, -2], "max": [5.5, 2, 2]});
+    assert_eq!(open(serde_json::json!({"transform": transform, "domain": given})).domain().min, [2.5, -2.0, -2.0]);
+    assert_eq!(open(serde_json::json!({"domain": given})).domain().min, [2.5, -2.0, -2.0]);
+}
+
+#[test]
+fn a_flat_scene_only_moves_in_its_plane() {
+    let circle = br#"{"circle": {"radius": 0.5}}"#;
+    let turned = serde_json::json!({"transform": {"rotate": {"axis": [0, 0, 1], "angle": 30}, "translate": [1, 0, 0]}});
+    let field = open(circle, &options(turned)).unwrap();
+    assert_eq!(field.dimension(), 2);
+    let (value, gradient) = at(&*field, [1.75, 0.0, 9.0]);
+    assert!((value - 0.25).abs() < 1e-6 && (gradient[0] - 1.0).abs() < 1e-6 && gradient[2] == 0.0);
+    let tilted = serde_json::json!({"transform": {"rotate": {"axis": [1, 0, 0], "angle": 30}}});
+    assert_eq!(faults(circle, tilted), [("/transform".to_owned(), "not_offered")]);
+}
+
+#[test]
 fn files_are_described() {
     let describe = |bytes: &[u8]| serde_json::to_value(describe(bytes).unwrap()).unwrap();
     let blob = describe(&fixture("blob.npz"));

@@ -54,7 +54,8 @@ fn folded(s: &[u32; 3], sp: [DVec3; 3], t: &[u32; 3], tp: [DVec3; 3]) -> bool {
     let (u, v) = (sp[k] - a, tp[alone(t, s)] - a);
     let edge = b - a;
     let (m, n) = (edge.cross(u), edge.cross(v));
-    m.dot(n) > 0.0 && m.cross(n).length_squared() <= 1e-28 * m.length_squared() * n.length_squared()
+    // planes within a millionth of a radian of each other, where the input's own rounding decides
+    m.dot(n) > 0.0 && m.cross(n).length_squared() <= 1e-12 * m.length_squared() * n.length_squared()
 }
 
 /// Whether the segment from `p` to `q` meets the triangle.

@@ -132,18 +132,17 @@ impl Tree {
             }
             let node = &self.nodes[child as usize];
             let mut scores = [0.0f32; 4];
-            for axis in 0..3 {
-                for (slot, score) in scores.iter_mut().enumerate() {
-                    let below = node.low[axis][slot] - q[axis];
-                    let above = q[axis] - node.high[axis][slot];
+            for (&q, (low, high)) in q.iter().zip(node.low.iter().zip(&node.high)) {
+                for (score, (low, high)) in scores.iter_mut().zip(low.iter().zip(high)) {
+                    let (below, above) = (low - q, q - high);
                     let outside = if below > above { below } else { above };
                     let outside = if outside > 0.0 { outside } else { 0.0 };
                     *score += outside * outside;
                 }
             }
             let waiting = height;
-            for slot in 0..4 {
-                let (score, child) = (scores[slot] * SHORTENED, node.children[slot]);
+            for (score, &child) in scores.iter().zip(&node.children) {
+                let score = score * SHORTENED;
                 if child == ABSENT || f64::from(score) > bound {
                     continue;
                 }

@@ -217,7 +217,7 @@ fn blend<const G: bool>(
 
 /// Adds amplitude times the product of sin(frequency * coordinate) over the axes whose frequency is not 0.
 fn displace<const G: bool>(amplitude: f32, frequency: [f32; 3], p: Place<'_>, out: &mut Out<'_>) {
-    for i in 0..out.value.len() {
+    for (i, value) in out.value.iter_mut().enumerate() {
         let (mut sines, mut slopes) = ([1.0f32; 3], [0.0f32; 3]);
         for k in 0..3 {
             if frequency[k] != 0.0 {
@@ -225,7 +225,7 @@ fn displace<const G: bool>(amplitude: f32, frequency: [f32; 3], p: Place<'_>, ou
                 (sines[k], slopes[k]) = (sine, frequency[k] * cosine);
             }
         }
-        out.value[i] += amplitude * sines[0] * sines[1] * sines[2];
+        *value += amplitude * sines[0] * sines[1] * sines[2];
         if G {
             for k in 0..3 {
                 out.gradient[k][i] += amplitude * slopes[k] * sines[(k + 1) % 3] * sines[(k + 2) % 3];

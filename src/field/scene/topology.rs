@@ -82,7 +82,7 @@ fn euler(inside: &[bool], layers: usize) -> i64 {
     sum
 }
 
-pub(super) fn examples(folder: &str) -> Vec<(String, Scene)> {
+fn examples(folder: &str) -> Vec<(String, Scene)> {
     let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join(folder);
     let mut files: Vec<_> = std::fs::read_dir(folder)
         .unwrap()
@@ -116,10 +116,10 @@ fn one_piece_without_tunnels(name: &str, scene: &Scene) {
     let fitted = scene.fit_domain().expect("an example is bounded");
     let spacing = 2.0 / (SIDE - 1) as f64;
     for (k, _) in inside.iter().enumerate().filter(|(_, i)| **i) {
-        let place = [k % SIDE, k / SIDE % SIDE].map(|c| -1.0 + spacing * c as f64);
-        for a in 0..2 {
-            assert!(place[a] >= fitted.min[a] && place[a] <= fitted.max[a], "{name}: the fitted domain is too small");
-        }
+        let place = [k % SIDE, k / SIDE % SIDE, k / (SIDE * SIDE)].map(|c| -1.0 + spacing * c as f64);
+        let place = if layers == 1 { [place[0], place[1], 0.0] } else { place };
+        let held = place.iter().zip(fitted.min).zip(fitted.max).all(|((c, lo), hi)| *c >= lo && *c <= hi);
+        assert!(held, "{name}: the fitted domain is too small");
     }
     assert_ne!(scene.metric(), Metric::Sign, "{name}");
 }

@@ -284,7 +284,7 @@ pub(super) fn neighbours(of: &Node, spacing: [f32; 3], count: [u32; 3], limit: u
     let ordered: [u32; 3] = std::array::from_fn(|k| {
         let reach = one.max[k].max(-one.min[k]).max(0.0);
         let m = (2.0 * reach / f64::from(spacing[k])).ceil().max(1.0);
-        if count[k] == 1 || !(m + 1.0 < f64::from(count[k])) { count[k] } else { m as u32 + 1 }
+        if count[k] > 1 && m + 1.0 < f64::from(count[k]) { m as u32 + 1 } else { count[k] }
     });
     let product = |n: [u32; 3]| n.iter().fold(1u64, |a, &b| a.saturating_mul(u64::from(b)));
     let exact = trust(of).outside;
