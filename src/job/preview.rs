@@ -3,7 +3,14 @@
 use crate::settings::Front;
 use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD;
+use glam::Vec3;
 use serde::{Deserialize, Serialize};
+use std::collections::HashMap;
+
+/// Vertices of a preview at most: some 40 kB as it is sent.
+const MAX_VERTICES: usize = 2048;
+/// Cells along an edge of the grid that a larger front is merged on, to begin with.
+const FINEST_CELLS: u32 = 32;
 
 /// Body of a `mesh` event.
 ///
@@ -33,6 +40,8 @@ impl MeshPreview {
         if front.positions.is_empty() || !front.positions.iter().flatten().all(|c| c.is_finite()) {
             return None;
         }
+        let coarse = coarsened(front);
+        let front = coarse.as_ref().unwrap_or(front);
         let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
         for p in &front.positions {
             for axis in 0..3 {
@@ -71,6 +80,46 @@ impl MeshPreview {
     }
 }
 
+/// The front with at most [`MAX_VERTICES`], by merging the vertices in each cell of a cubic grid at their mean; `None` when
+/// it is small enough as it is. Triangles that lose a corner are left out (Rossignac and Borrel 1993).
+fn coarsened(front: &Front) -> Option<Front> {
+    if front.positions.len() <= MAX_VERTICES {
+        return None;
+    }
+    let points: Vec<Vec3> = front.positions.iter().map(|&p| Vec3::from(p)).collect();
+    let low = points.iter().copied().reduce(Vec3::min)?;
+    let extent = (points.iter().copied().reduce(Vec3::max)? - low).max_element().max(f32::MIN_POSITIVE);
+    let mut cells = FINEST_CELLS;
+    loop {
+        let mut vertex_of_cell = HashMap::new();
+        let mut sums: Vec<(Vec3, u32)> = Vec::new();
+        let merged: Vec<u32> = points
+            .iter()
+            .map(|&p| {
+                let cell = ((p - low) * (cells as f32 / extent)).as_uvec3();
+                let vertex = *vertex_of_cell.entry(cell).or_insert(sums.len() as u32);
+                if vertex as usize == sums.len() {
+                    sums.push((Vec3::ZERO, 0));
+                }
+                let (sum, count) = &mut sums[vertex as usize];
+                *sum += p;
+                *count += 1;
+                vertex
+            })
+            .collect();
+        if sums.len() > MAX_VERTICES {
+            // a surface fills about the square of the number of cells along an edge
+            cells = (cells * 4 / 5).max(1);
+            continue;
+        }
+        let corners = front.triangles.iter().map(|t| t.map(|v| merged[v as usize]));
+        return Some(Front {
+            positions: sums.iter().map(|&(sum, count)| (sum / count as f32).to_array()).collect(),
+            triangles: corners.filter(|[a, b, c]| a != b && b != c && c != a).collect(),
+        });
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -92,6 +141,31 @@ mod tests {
             }
         }
         assert_eq!(BASE64_STANDARD.decode(&preview.triangles).expect("base64"), [0, 0, 1, 0, 2, 0]);
+    }
+
+    #[test]
+    fn a_fine_front_is_sent_coarse_and_whole() {
+        use crate::shrink::lattice::{LatticeSpec, SphereLattice};
+        let lattice = SphereLattice::new(LatticeSpec::Octahedral { n: 72 });
+        let front = Front {
+            positions: lattice.directions.iter().map(|d| d.as_vec3().to_array()).collect(),
+            triangles: lattice.triangles(&vec![false; lattice.quads.len()]),
+        };
+        let coarse = coarsened(&front).expect("20,738 vertices are too many");
+        assert!((MAX_VERTICES / 4..=MAX_VERTICES).contains(&coarse.positions.len()), "{}", coarse.positions.len());
+        assert!(coarse.positions.iter().all(|&p| (Vec3::from(p).length() - 1.0).abs() < 0.02), "on the sphere still");
+        assert!(coarse.triangles.iter().flatten().all(|&v| (v as usize) < coarse.positions.len()));
+        let volume: f32 = coarse
+            .triangles
+            .iter()
+            .map(|t| {
+                let [a, b, c] = t.map(|v| Vec3::from(coarse.positions[v as usize]));
+                a.dot(b.cross(c)) / 6.0
+            })
+            .sum();
+        assert!((volume - 4.19).abs() < 0.15, "closed, with the ball's volume: {volume}");
+        let preview = MeshPreview::new(&front).expect("finite");
+        assert!(preview.positions.len() + preview.triangles.len() < 50_000);
     }
 
     #[test]
