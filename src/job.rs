@@ -1,5 +1,5 @@
 //! What is asked of the service and what becomes of it: the request ([`JobSpec`]), the record ([`Job`]), its [`State`]s and
-//! [`Event`](event::Event)s, and the worker that runs it on the rayon pool.
+//! [`Event`]s, and the worker that runs it on the rayon pool.
 //!
 //! Guarantees: a request that was accepted can be read back and run by any later process; a record's `revision` grows with
 //! every change. This room may read the clock; the numeric rooms below it may not.

@@ -169,10 +169,10 @@ fn simple_table() -> &'static [bool] {
     static TABLE: OnceLock<Vec<bool>> = OnceLock::new();
     TABLE.get_or_init(|| {
         let mut adjacent = [0u16; 14];
-        for i in 0..14 {
-            for j in 0..14 {
-                if NEIGHBOURS.contains(&(NEIGHBOURS[j] - NEIGHBOURS[i])) {
-                    adjacent[i] |= 1 << j;
+        for (set, from) in adjacent.iter_mut().zip(NEIGHBOURS) {
+            for (j, to) in NEIGHBOURS.into_iter().enumerate() {
+                if NEIGHBOURS.contains(&(to - from)) {
+                    *set |= 1 << j;
                 }
             }
         }

@@ -258,11 +258,11 @@ impl Mesh {
 
     /// Moves every vertex towards its target, each step shortened until no triangle turns by more than acos(`turn`).
     pub fn move_towards(&mut self, targets: &[DVec3], turn: f64) {
-        for v in 0..self.positions.len() {
+        for (v, target) in targets.iter().enumerate() {
             let from = self.positions[v];
             let mut step = 1.0;
             for _ in 0..4 {
-                let to = from + step * (targets[v] - from);
+                let to = from + step * (target - from);
                 if self.may_move(v as u32, to, None, turn) {
                     self.positions[v] = to;
                     break;

@@ -267,8 +267,7 @@ impl Relaxer<'_> {
         for t in &self.star {
             let area = t.reference.area;
             let d = x.dot(t.b.cross(t.c)) / (2.0 * area);
-            // also false for NaN
-            if !(d > 1e-14) {
+            if d.is_nan() || d <= 1e-14 {
                 return f64::INFINITY;
             }
             let dirichlet = t.reference.dirichlet(x, t.b, t.c);
@@ -300,8 +299,7 @@ impl Relaxer<'_> {
         let (e1, e2) = tangents(x);
         let mut step = newton_direction(gradient, &hessian, diagonal - gradient.dot(x), e1, e2);
         let length = step.length();
-        // also false for NaN
-        if !(length > 1e-15) {
+        if length.is_nan() || length <= 1e-15 {
             return 0.0;
         }
         let reach = 0.7 * self.star.iter().map(|t| x.distance_squared(t.b)).fold(0.0, f64::max).sqrt();

@@ -129,8 +129,7 @@ fn relax_vertex(problem: &Problem<'_>, positions: &mut [DVec3], v: u32, star: &m
     let (e1, e2) = tangents(problem.normals[v as usize]);
     let mut step = newton_direction(gradient, &hessian, diagonal, e1, e2);
     let length = step.length();
-    // also false for NaN
-    if !(length > 1e-15) {
+    if length.is_nan() || length <= 1e-15 {
         return;
     }
     let reach = 0.5 * star.iter().map(|t| x.distance_squared(t.b)).fold(0.0, f64::max).sqrt();

@@ -1,7 +1,7 @@
 //! The npz files of neural-implicit-queries (N. Sharp and A. Jacobson, Spelunking the Deep, 2022).
 //!
 //! An archive of arrays named `NNNN.operation.parameter`, operations applied in the order of NNNN: `dense` with `A` of
-//! shape [inputs, outputs] and `b` of shape [outputs], activations (`relu`, `elu`, `tanh`, `sigmoid`, `sin`) and at last
+//! shape `[inputs, outputs]` and `b` of shape `[outputs]`, activations (`relu`, `elu`, `tanh`, `sigmoid`, `sin`) and at last
 //! `squeeze_last` with a parameter `_` that means nothing. The shape lies in the cube of half extent 1.
 
 use super::{Activation, Encoding, Layer, MAX_LAYERS, MAX_PARAMETERS, Network, zip};

@@ -1,7 +1,7 @@
 //! shrinkd's own weight files: safetensors with the architecture as JSON in the metadata.
 //!
 //! The metadata member `architecture` holds an [`Architecture`]; layer i has the tensors `layers.i.weight` of shape
-//! [outputs, inputs] and `layers.i.bias` of shape [outputs], and `latent_codes` of shape [n, latent_size] may come along.
+//! `[outputs, inputs]` and `layers.i.bias` of shape `[outputs]`, and `latent_codes` of shape `[n, latent_size]` may come along.
 //! Numbers are F32 or F64. `docs/networks.md` describes the format for those who write it.
 
 use super::{Activation, Encoding, Layer, MAX_LAYERS, MAX_PARAMETERS, Network, Skip};
