@@ -1,7 +1,7 @@
 //! `method: adaptive`: contract, remesh, map, resample, untangle; again and finer where the result is folded.
 
 use super::base::base;
-use super::contract::{Resolution, contract};
+use super::contract::{Refusal, Resolution, contract};
 use super::creases::{choose_diagonals, snap};
 use super::density::density;
 use super::lattice::SphereLattice;
@@ -48,10 +48,9 @@ pub fn run(sampler: &Sampler<'_>, spec: &ShrinkSpec) -> Result<Wrap, ShrinkError
                     break;
                 }
             }
-            Err(ShrinkError::Canceled(c)) => return Err(c.into()),
             // a finer lattice may see a gap or a wall that this one did not
-            Err(e @ (ShrinkError::Components { .. } | ShrinkError::Genus { .. })) => refusal = Some(e),
-            Err(e) => return Err(e),
+            Err(refused) if !refused.certain => refusal = Some(refused.error),
+            Err(refused) => return Err(refused.error),
         }
     }
     match (best, refusal) {
@@ -61,7 +60,7 @@ pub fn run(sampler: &Sampler<'_>, spec: &ShrinkSpec) -> Result<Wrap, ShrinkError
     }
 }
 
-fn one(scene: &Sampler<'_>, lattice: &SphereLattice, attempt: &Attempt) -> Result<(usize, Wrap), ShrinkError> {
+fn one(scene: &Sampler<'_>, lattice: &SphereLattice, attempt: &Attempt) -> Result<(usize, Wrap), Refusal> {
     let settings = *scene.settings();
     let (start, end) = attempt.share;
     let stage = |name: &'static str, done: f32, front: Option<Front>, energy: Option<f64>, flips: Option<u64>| {
@@ -89,8 +88,7 @@ fn one(scene: &Sampler<'_>, lattice: &SphereLattice, attempt: &Attempt) -> Resul
     let map = sphere_map(&mesh, &density(&mesh), BETA, settings.cancel)?.ok_or(ShrinkError::Unmapped)?;
     stage("resample", 0.75, None, Some(map.energy), None);
     let directions = orient(&mesh, &map.directions, lattice.spec);
-    let landed = land(&mesh, &directions, lattice);
-    settings.cancel.check()?;
+    let landed = land(&mesh, &directions, lattice, settings.cancel)?;
     let edge = (mesh.area() / lattice.directions.len() as f64).sqrt();
     let mut at = project(&sampler, landed.clone(), edge, 1e-3 * edge)?;
     stage("untangle", 0.85, None, None, None);

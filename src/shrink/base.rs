@@ -24,10 +24,9 @@ pub fn base(front: Front, vertices: usize, sampler: &Sampler<'_>) -> Result<(Mes
     for round in 0..3 {
         // the front's own staircase may turn freely, later rounds may not
         let (turn, guard) = if round == 0 { (-0.2, -0.5) } else { (0.3, 0.0) };
-        sampler.settings().cancel.check()?;
-        remesh(&mut mesh, target, 0.6, turn);
+        remesh(&mut mesh, target, 0.6, turn, sampler.settings().cancel)?;
         if round == 0 {
-            remesh(&mut mesh, target, 0.6, turn);
+            remesh(&mut mesh, target, 0.6, turn, sampler.settings().cancel)?;
         }
         onto_zero(&mut mesh, sampler, target, guard)?;
     }
@@ -92,6 +91,7 @@ fn unfold(mut mesh: Mesh, target: f64, sampler: &Sampler<'_>) -> Result<(Mesh, u
             for (&v, g) in around.iter().zip(gradients) {
                 normals[v as usize] = g.normalize_or(DVec3::Z);
             }
+            sampler.settings().cancel.check()?;
             mix_targets(&mut targets, &triangles, &mask, &normals);
             relax(
                 &Problem {
@@ -114,7 +114,7 @@ fn unfold(mut mesh: Mesh, target: f64, sampler: &Sampler<'_>) -> Result<(Mesh, u
             let moved = points[k] + step_to_zero(values[k], gradients[k], target);
             mesh.positions[v as usize] = before[v as usize] + (moved - before[v as usize]).clamp_length_max(target);
         }
-        remesh(&mut mesh, target, 0.0, 0.2);
+        remesh(&mut mesh, target, 0.0, 0.2, sampler.settings().cancel)?;
         onto_zero(&mut mesh, sampler, target, -0.2)?;
     }
     Ok(best.map_or((mesh, 0), |(folded, mesh)| (mesh, folded)))

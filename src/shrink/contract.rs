@@ -29,6 +29,8 @@ const SOLID: f64 = 0.45;
 /// Nodes that could not be given up and are farther outside than this many spacings are the membrane of a handle, the
 /// bridge to another component, or a void.
 const OBSTRUCTION: f64 = 1.8;
+/// An obstruction that reaches farther outside than this many spacings is no matter of resolution.
+const CERTAIN: f64 = 6.0;
 
 /// The front after the contraction: a closed surface of genus 0 around the lattice's inside nodes.
 pub struct Front {
@@ -36,6 +38,20 @@ pub struct Front {
     pub mesh: Mesh,
     /// The frame that the front is in: about unit size, centred on the shape.
     pub frame: Frame,
+}
+
+/// Why there is no front, and whether a finer lattice could see it differently.
+pub struct Refusal {
+    /// The cause.
+    pub error: ShrinkError,
+    /// Whether no finer lattice would change it.
+    pub certain: bool,
+}
+
+impl<E: Into<ShrinkError>> From<E> for Refusal {
+    fn from(error: E) -> Self {
+        Self { error: error.into(), certain: true }
+    }
 }
 
 /// How finely to contract.
@@ -50,8 +66,9 @@ pub struct Resolution {
 /// Contracts a sphere around the domain onto the zero level set.
 ///
 /// # Errors
-/// [`ShrinkError::Empty`], [`ShrinkError::Components`], [`ShrinkError::Genus`] and [`ShrinkError::Canceled`].
-pub fn contract(scene: &Sampler<'_>, resolution: Resolution) -> Result<Front, ShrinkError> {
+/// A [`Refusal`] with [`ShrinkError::Empty`], [`ShrinkError::Components`], [`ShrinkError::Genus`] or
+/// [`ShrinkError::Canceled`].
+pub fn contract(scene: &Sampler<'_>, resolution: Resolution) -> Result<Front, Refusal> {
     let settings = *scene.settings();
     let domain = scene.domain();
     let (mut lo, mut hi) = (DVec3::from(domain.min), DVec3::from(domain.max));
@@ -68,7 +85,7 @@ pub fn contract(scene: &Sampler<'_>, resolution: Resolution) -> Result<Front, Sh
     }
     let Some((solid_lo, solid_hi)) = grid.solid_box() else {
         let (min, max) = grid.values.iter().fold((f32::MAX, f32::MIN), |(a, b), &v| (a.min(v), b.max(v)));
-        return Err(ShrinkError::Empty { min: f64::from(min), max: f64::from(max) });
+        return Err(ShrinkError::Empty { min: f64::from(min), max: f64::from(max) }.into());
     };
     let solid = (solid_hi - solid_lo).max_element();
     if solid < FOCUS * size {
@@ -103,9 +120,10 @@ pub fn contract(scene: &Sampler<'_>, resolution: Resolution) -> Result<Front, Sh
     let inside = carve(&grid, &target, settings.cancel)?;
 
     let limit = (OBSTRUCTION * grid.h) as f32;
-    let obstructed = (0..grid.len()).any(|i| inside[i] && target[i] > limit);
-    if obstructed {
-        topology::explain(&grid, &target, &inside, limit, frame)?;
+    let stuck = (0..grid.len()).filter(|&i| inside[i]).map(|i| target[i]).fold(0.0, f32::max);
+    if stuck > limit {
+        let certain = f64::from(stuck) > CERTAIN * grid.h;
+        topology::explain(&grid, &target, &inside, limit, frame).map_err(|error| Refusal { error, certain })?;
     }
     let moved: HashMap<usize, DVec3> = thin.into_iter().filter(|&(i, _)| inside[i]).collect();
     let mesh = extract(&grid, &inside, &moved, settings.cancel)?;
@@ -248,7 +266,7 @@ fn extract(
     inside: &[bool],
     moved: &HashMap<usize, DVec3>,
     cancel: &CancelToken,
-) -> Result<Mesh, ShrinkError> {
+) -> Result<Mesh, Canceled> {
     const ORDERS: [[usize; 3]; 6] = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
     /// An edge's vertex keeps this share of the edge from either end, so that no triangle vanishes.
     const EDGE: f64 = 0.05;

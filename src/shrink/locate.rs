@@ -1,6 +1,7 @@
 //! Finding the spherical triangle that holds a direction.
 
 use super::rings::Mesh;
+use crate::settings::{CancelToken, Canceled};
 use glam::DVec3;
 use std::collections::HashMap;
 
@@ -9,7 +10,12 @@ pub type Place = ([u32; 3], [f64; 3]);
 
 /// Locates `queries` in the map `directions` of `mesh` by walking from triangle to triangle. Near queries should follow
 /// each other. A walk that does not end falls back to looking at every triangle.
-pub fn locate(mesh: &Mesh, directions: &[DVec3], queries: &[DVec3]) -> Vec<Place> {
+pub fn locate(
+    mesh: &Mesh,
+    directions: &[DVec3],
+    queries: &[DVec3],
+    cancel: &CancelToken,
+) -> Result<Vec<Place>, Canceled> {
     /// Steps after which a walk is given up.
     const PATIENCE: usize = 4000;
     let triangles = mesh.rings.triangles();
@@ -29,7 +35,11 @@ pub fn locate(mesh: &Mesh, directions: &[DVec3], queries: &[DVec3]) -> Vec<Place
     let (mut current, mut seed) = (0usize, 12345u64);
     queries
         .iter()
-        .map(|&q| {
+        .enumerate()
+        .map(|(i, &q)| {
+            if i.is_multiple_of(1024) {
+                cancel.check()?;
+            }
             let mut found = None;
             for _ in 0..PATIENCE {
                 let w = weights(current, q);
@@ -59,7 +69,7 @@ pub fn locate(mesh: &Mesh, directions: &[DVec3], queries: &[DVec3]) -> Vec<Place
             });
             let w = w.map(|x| x.max(0.0));
             let sum: f64 = w.iter().sum();
-            (triangles[current], w.map(|x| x / sum))
+            Ok((triangles[current], w.map(|x| x / sum)))
         })
         .collect()
 }

@@ -3,6 +3,7 @@
 //! a triangle over.
 
 use super::rings::Mesh;
+use crate::settings::{CancelToken, Canceled};
 use glam::DVec3;
 
 /// Edges longer than this many target lengths are split.
@@ -12,15 +13,19 @@ const SHORT: f64 = 0.8;
 
 /// One round of split, collapse, flip and, where `smooth` > 0, tangential smoothing with that step. `turn` is the cosine
 /// of the largest angle that a triangle may turn by.
-pub fn remesh(mesh: &mut Mesh, target: f64, smooth: f64, turn: f64) {
+pub fn remesh(mesh: &mut Mesh, target: f64, smooth: f64, turn: f64, cancel: &CancelToken) -> Result<(), Canceled> {
     split(mesh, target);
-    collapse(mesh, target, turn);
+    cancel.check()?;
+    collapse(mesh, target, turn, cancel)?;
+    cancel.check()?;
     flip(mesh, target);
+    cancel.check()?;
     let kept = mesh.rings.compact();
     mesh.positions = kept.iter().map(|&v| mesh.positions[v as usize]).collect();
     if smooth > 0.0 {
         slide(mesh, smooth, turn);
     }
+    cancel.check()
 }
 
 /// Edges for which `wanted` holds, with their lengths, in order of vertex numbers.
@@ -50,15 +55,18 @@ fn split(mesh: &mut Mesh, target: f64) {
     }
 }
 
-fn collapse(mesh: &mut Mesh, target: f64, turn: f64) {
+fn collapse(mesh: &mut Mesh, target: f64, turn: f64, cancel: &CancelToken) -> Result<(), Canceled> {
     /// A closed mesh keeps at least this many vertices.
     const FEWEST: usize = 8;
     let mut short = edges(mesh, |length| length < SHORT * target);
     short.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
     let mut alive = (0..mesh.rings.len() as u32).filter(|&v| mesh.rings.alive(v)).count();
-    for (_, a, b) in short {
+    for (i, (_, a, b)) in short.into_iter().enumerate() {
         if alive <= FEWEST {
             break;
+        }
+        if i.is_multiple_of(1024) {
+            cancel.check()?;
         }
         let gone = !mesh.rings.alive(a) || !mesh.rings.alive(b) || !mesh.rings.joined(a, b);
         if gone || mesh.length(a, b) > SHORT * target || !mesh.rings.collapsible(a, b) {
@@ -79,6 +87,7 @@ fn collapse(mesh: &mut Mesh, target: f64, turn: f64) {
             break;
         }
     }
+    Ok(())
 }
 
 fn cosine(a: DVec3, b: DVec3) -> f64 {

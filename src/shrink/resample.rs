@@ -4,6 +4,7 @@
 use super::lattice::{LatticeSpec, SphereLattice};
 use super::locate::locate;
 use super::rings::Mesh;
+use crate::settings::{CancelToken, Canceled};
 use glam::{DMat3, DVec3};
 use std::f64::consts::PI;
 
@@ -79,9 +80,12 @@ fn pole_rotation(mesh: &Mesh, directions: &[DVec3]) -> DMat3 {
 }
 
 /// Where every lattice vertex lands on the base mesh, by linear interpolation in its triangle.
-pub fn land(mesh: &Mesh, directions: &[DVec3], lattice: &SphereLattice) -> Vec<DVec3> {
-    locate(mesh, directions, &lattice.directions)
-        .into_iter()
-        .map(|(t, w)| (0..3).map(|c| w[c] * mesh.positions[t[c] as usize]).sum())
-        .collect()
+pub fn land(
+    mesh: &Mesh,
+    directions: &[DVec3],
+    lattice: &SphereLattice,
+    cancel: &CancelToken,
+) -> Result<Vec<DVec3>, Canceled> {
+    let places = locate(mesh, directions, &lattice.directions, cancel)?;
+    Ok(places.into_iter().map(|(t, w)| (0..3).map(|c| w[c] * mesh.positions[t[c] as usize]).sum()).collect())
 }

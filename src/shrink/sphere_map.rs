@@ -70,10 +70,7 @@ pub fn sphere_map(
         map.directions[*v as usize] = q;
         map.rings.uncollapse(*v, ring);
         active.push(*v);
-        map.settle(*v, ring, active.len());
-        if active.len().is_multiple_of(256) {
-            cancel.check()?;
-        }
+        map.settle(*v, ring, active.len(), cancel)?;
         if active.len() >= next_sweep && active.len() < n {
             next_sweep = (active.len() as f64 * GROWTH).ceil() as usize + 1;
             map.sweep(&active, if active.len() < 500 { 4 * SWEEPS.0 } else { SWEEPS.0 }, cancel)?;
@@ -192,6 +189,9 @@ fn decimate(mesh: &Mesh, rings: &mut Rings, cancel: &CancelToken) -> Result<Opti
             }
             refilled_at = alive;
             for v in (0..n as u32).filter(|&v| rings.alive(v)) {
+                if v.is_multiple_of(1024) {
+                    cancel.check()?;
+                }
                 stamps[v as usize] += 1;
                 if let Some((cost, w)) = cheapest(rings, &quadrics, v) {
                     targets[v as usize] = w;
@@ -210,7 +210,7 @@ fn decimate(mesh: &Mesh, rings: &mut Rings, cancel: &CancelToken) -> Result<Opti
             let gone = quadrics[v as usize];
             quadrics[w as usize].add(&gone);
             alive -= 1;
-            if alive.is_multiple_of(1024) {
+            if alive.is_multiple_of(256) {
                 cancel.check()?;
             }
             touched = rings.ring(w).to_vec();
@@ -368,7 +368,8 @@ impl Relaxer<'_> {
     }
 
     /// Relaxes a vertex that was just inserted, its ring, and a growing patch where that is not enough.
-    fn settle(&mut self, v: u32, ring: &[u32], size: usize) {
+    fn settle(&mut self, v: u32, ring: &[u32], size: usize, cancel: &CancelToken) -> Result<(), Canceled> {
+        cancel.check()?;
         self.relax(v);
         self.relax(v);
         let rounds = if size < 200 { 3 } else { 1 };
@@ -383,7 +384,7 @@ impl Relaxer<'_> {
         }
         let (energy, area) = self.star_energy(v);
         if energy < TROUBLE * area {
-            return;
+            return Ok(());
         }
         let (mut patch, mut seen, mut rim) = (vec![v], HashSet::from([v]), vec![v]);
         for grown in 0..6 {
@@ -398,13 +399,14 @@ impl Relaxer<'_> {
             patch.extend_from_slice(&next);
             rim = next;
             if patch.len() > 600 {
-                return;
+                return Ok(());
             }
             if grown == 0 {
                 continue;
             }
             let mut last = f64::INFINITY;
             for round in 0..40 {
+                cancel.check()?;
                 for i in 0..patch.len() {
                     self.relax(if round % 2 == 0 { patch[i] } else { patch[patch.len() - 1 - i] });
                 }
@@ -415,17 +417,20 @@ impl Relaxer<'_> {
                 last = energy;
             }
             if self.star_energy(v).0 < TROUBLE * area {
-                return;
+                return Ok(());
             }
         }
+        Ok(())
     }
 
     /// Gauss-Seidel sweeps, forth and back, until the energy falls slowly.
     fn sweep(&mut self, active: &[u32], sweeps: usize, cancel: &CancelToken) -> Result<(), Canceled> {
         for round in 0..6 * sweeps {
-            cancel.check()?;
             let mut fallen = 0.0;
             for i in 0..active.len() {
+                if i.is_multiple_of(1024) {
+                    cancel.check()?;
+                }
                 fallen += self.relax(if round % 2 == 0 { active[i] } else { active[active.len() - 1 - i] });
             }
             // an energy that was infinite falls by infinity

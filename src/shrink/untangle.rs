@@ -80,6 +80,7 @@ impl<'a> Tangle<'a> {
         };
         let mut best: Option<(usize, OnZero)> = None;
         for round in 0..ROUNDS {
+            self.sampler.settings().cancel.check()?;
             let (along, mut targets) = self.agreement(at)?;
             let folded = along.iter().filter(|&&a| a <= FOLD).count();
             if best.as_ref().is_none_or(|b| folded < b.0) {
