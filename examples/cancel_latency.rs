@@ -8,7 +8,7 @@
 use shrinkd::field::input::{FieldOptions, open};
 use shrinkd::field::sampler::{Sampler, Tally};
 use shrinkd::settings::{CancelToken, Settings};
-use shrinkd::shrink::{ShrinkSpec, shrink};
+use shrinkd::shrink::{Effort, ShrinkSpec, shrink};
 use std::time::{Duration, Instant};
 
 /// Moments tried for each field.
@@ -21,7 +21,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let run = |cancel: &CancelToken| {
             let settings = Settings { pool: &pool, cancel, progress: &|_| {} };
             let tally = Tally::new();
-            shrink(&Sampler::new(field.as_ref(), settings, &tally), &ShrinkSpec::default()).is_err()
+            shrink(&Sampler::new(field.as_ref(), settings, &tally), &ShrinkSpec::default(), &Effort::default()).is_err()
         };
         let clock = Instant::now();
         run(&CancelToken::new());

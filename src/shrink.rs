@@ -48,6 +48,75 @@ pub struct ShrinkSpec {
     pub method: Method,
     /// Where the sphere is sampled.
     pub lattice: LatticeSpec,
+    /// How the samples are spread over the surface.
+    pub density: Density,
+    /// What the sphere map keeps best.
+    pub distortion: Distortion,
+    /// What to do with a shape that is no sphere.
+    pub on_topology: OnTopology,
+    /// Which component to wrap where there are several; without it several are refused.
+    pub component: Option<Component>,
+}
+
+/// How the samples are spread over the surface.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Density {
+    /// Evenly by area.
+    Area,
+    /// More where the surface is curved.
+    #[default]
+    Curvature,
+    /// More where the solid or the space beside it is thin.
+    Reach,
+}
+
+/// What the sphere map keeps best.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Distortion {
+    /// Areas, as far as the density allows.
+    Area,
+    /// Angles.
+    Angle,
+    /// Both: lengths.
+    #[default]
+    Isometric,
+}
+
+/// What to do with a shape that is no sphere.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum OnTopology {
+    /// Say how many components or handles there are and where.
+    #[default]
+    Refuse,
+    /// Wrap it in a sphere all the same and say how much area had to be invented.
+    Wrap,
+}
+
+/// One component of several.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Component {
+    /// The one of the largest volume.
+    Largest,
+    /// The one with this index, from 0, in the order of volume, largest first.
+    Index(u32),
+}
+
+/// How hard to try, and what is known from the attempts before.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Effort {
+    /// Number of the attempt, from 0, below [`Effort::ATTEMPTS`]; later ones work finer.
+    pub attempt: u32,
+    /// Places in scene units where the attempts before went wrong; this one looks closer there.
+    pub places: Vec<DVec3>,
+}
+
+impl Effort {
+    /// Attempts worth making.
+    pub const ATTEMPTS: u32 = 3;
 }
 
 /// A sphere lattice laid onto the zero level set.
@@ -112,12 +181,12 @@ pub enum ShrinkError {
 ///
 /// # Errors
 /// [`ShrinkError`] when the run was canceled, or when the zero level set is empty, in several pieces or has handles.
-pub fn shrink(sampler: &Sampler<'_>, spec: &ShrinkSpec) -> Result<Wrap, ShrinkError> {
+pub fn shrink(sampler: &Sampler<'_>, spec: &ShrinkSpec, effort: &Effort) -> Result<Wrap, ShrinkError> {
     if sampler.field().dimension() != 3 {
         return Err(ShrinkError::Dimension { found: sampler.field().dimension(), wanted: 3 });
     }
     match spec.method {
-        Method::Adaptive => adaptive::run(sampler, spec),
+        Method::Adaptive => adaptive::run(sampler, spec, effort),
         Method::Paper => paper::run(sampler, spec),
     }
 }

@@ -51,7 +51,7 @@ fn extract(args: &ExtractArgs) -> Result<bool, (u8, String)> {
         bar.set_message(progress.stage);
     };
     let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress };
-    let shrink = ShrinkSpec { method: args.method.into(), lattice: args.lattice };
+    let shrink = ShrinkSpec { method: args.method.into(), lattice: args.lattice, ..ShrinkSpec::default() };
     let load = clock.elapsed().as_secs_f64();
     let ended = |ended: Ended| match ended {
         Ended::Failed(failure) if failure.is_bad_input() => (BAD_INPUT, in_field(&failure.detail)),

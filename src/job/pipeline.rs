@@ -11,7 +11,7 @@ use crate::measure::{self, Report};
 use crate::settings::{Progress, Settings};
 use crate::shrink::curve::{CurveReport, CurveSpec, shrink_curve};
 use crate::shrink::lattice::LatticeSpec;
-use crate::shrink::{ShrinkSpec, shrink};
+use crate::shrink::{Effort, ShrinkSpec, shrink};
 use crate::surface::{self, Surface};
 use serde_json::{Value, json};
 use std::time::Instant;
@@ -95,7 +95,7 @@ pub fn make(
     let tally = Tally::new();
     let sampler = Sampler::new(opened.field.as_ref(), Settings { progress: &told, ..settings }, &tally);
     let clock = Instant::now();
-    let wrap = shrink(&sampler, spec)?;
+    let wrap = shrink(&sampler, spec, &Effort::default())?;
     let spent = tally.by_stage();
     let shrink_seconds = clock.elapsed().as_secs_f64();
 

@@ -10,7 +10,7 @@ use super::sphere_map::sphere_map;
 use super::unfold::Corners;
 use super::untangle::Tangle;
 use super::zero::{OnZero, project};
-use super::{ShrinkError, ShrinkSpec, Wrap};
+use super::{Effort, ShrinkError, ShrinkSpec, Wrap};
 use crate::field::Sampler;
 use crate::settings::{Front, Progress};
 use glam::DVec3;
@@ -33,34 +33,22 @@ const ATTEMPTS: [Attempt; 3] = [
     Attempt { resolution: Resolution { levels: 4, probe: false }, base_vertices: 20_000, share: (0.9, 1.0) },
 ];
 
-/// Runs attempts until one has no fold; the one with the fewest is returned when none has.
-pub fn run(sampler: &Sampler<'_>, spec: &ShrinkSpec) -> Result<Wrap, ShrinkError> {
+/// Makes one attempt; a refusal that a finer lattice could see differently is looked at by the later ones.
+pub fn run(sampler: &Sampler<'_>, spec: &ShrinkSpec, effort: &Effort) -> Result<Wrap, ShrinkError> {
     let lattice = SphereLattice::new(spec.lattice);
-    let mut best: Option<(usize, Wrap)> = None;
+    let first = (effort.attempt as usize).min(ATTEMPTS.len() - 1);
     let mut refusal = None;
-    for attempt in &ATTEMPTS {
+    for attempt in &ATTEMPTS[first..] {
         match one(sampler, &lattice, attempt) {
-            Ok((folds, wrap)) => {
-                if best.as_ref().is_none_or(|b| folds < b.0) {
-                    best = Some((folds, wrap));
-                }
-                if folds == 0 {
-                    break;
-                }
-            }
-            // a finer lattice may see a gap or a wall that this one did not
+            Ok(wrap) => return Ok(wrap),
             Err(refused) if !refused.certain => refusal = Some(refused.error),
             Err(refused) => return Err(refused.error),
         }
     }
-    match (best, refusal) {
-        (Some((_, wrap)), _) => Ok(wrap),
-        (None, Some(e)) => Err(e),
-        (None, None) => unreachable!("every attempt gives a wrap or an error"),
-    }
+    Err(refusal.unwrap_or(ShrinkError::Unmapped))
 }
 
-fn one(scene: &Sampler<'_>, lattice: &SphereLattice, attempt: &Attempt) -> Result<(usize, Wrap), Refusal> {
+fn one(scene: &Sampler<'_>, lattice: &SphereLattice, attempt: &Attempt) -> Result<Wrap, Refusal> {
     let settings = *scene.settings();
     let (start, end) = attempt.share;
     let stage = |name: &'static str, done: f32, front: Option<Front>, energy: Option<f64>, flips: Option<u64>| {
@@ -105,7 +93,7 @@ fn one(scene: &Sampler<'_>, lattice: &SphereLattice, attempt: &Attempt) -> Resul
     let triangles = lattice.triangles(&diagonals);
     stage("sharpen", 1.0, Some(show(&at.positions, triangles)), None, Some(folds as u64));
     let values = at.values.iter().map(|s| s * frame.scale).collect();
-    Ok((folds, Wrap { lattice: lattice.clone(), positions, values, gradients: at.gradients, diagonals }))
+    Ok(Wrap { lattice: lattice.clone(), positions, values, gradients: at.gradients, diagonals })
 }
 
 /// Moves vertices onto creases and turns diagonals along them; keeps what it was given where that folds more.
