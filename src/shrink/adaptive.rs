@@ -69,10 +69,10 @@ fn one(scene: &Sampler<'_>, lattice: &SphereLattice, attempt: &Attempt) -> Resul
         positions: positions.iter().map(|&p| frame.to_scene(p).as_vec3().to_array()).collect(),
         triangles,
     };
-    stage("remesh", 0.25, None, None, None);
+    stage("remesh", 0.25, Some(show(&front.mesh.positions, front.mesh.rings.triangles())), None, None);
     let sampler = scene.framed(frame);
-    let (mesh, folded) = base(front, attempt.base_vertices, &sampler)?;
-    stage("map", 0.45, Some(show(&mesh.positions, mesh.rings.triangles())), None, Some(folded as u64));
+    let mesh = base(front, attempt.base_vertices, &sampler)?;
+    stage("map", 0.45, Some(show(&mesh.positions, mesh.rings.triangles())), None, None);
     let map = sphere_map(&mesh, &density(&mesh), BETA, settings.cancel)?.ok_or(ShrinkError::Unmapped)?;
     stage("resample", 0.75, None, Some(map.energy), None);
     let directions = orient(&mesh, &map.directions, lattice.spec);

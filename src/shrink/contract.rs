@@ -32,6 +32,9 @@ const OBSTRUCTION: f64 = 1.8;
 /// An obstruction that reaches farther outside than this many spacings is no matter of resolution.
 const CERTAIN: f64 = 6.0;
 
+/// The orders in which the six Kuhn tetrahedra of a cell go through the axes; every other one is left-handed.
+const ORDERS: [[usize; 3]; 6] = [[0, 1, 2], [0, 2, 1], [1, 2, 0], [1, 0, 2], [2, 0, 1], [2, 1, 0]];
+
 /// The front after the contraction: a closed surface of genus 0 around the lattice's inside nodes.
 pub struct Front {
     /// The surface, in frame units.
@@ -78,12 +81,12 @@ pub fn contract(scene: &Sampler<'_>, resolution: Resolution) -> Result<Front, Re
     grid = grid.refine(scene, reach(&grid, slope, false))?;
     // a shape smaller than the lattice's cells shows itself only in a finer one
     for _ in 0..3 {
-        if grid.solid_box().is_some() {
+        if grid.solid_box(slope).is_some() {
             break;
         }
         grid = grid.refine(scene, reach(&grid, slope, false))?;
     }
-    let Some((solid_lo, solid_hi)) = grid.solid_box() else {
+    let Some((solid_lo, solid_hi)) = grid.solid_box(slope) else {
         let (min, max) = grid.values.iter().fold((f32::MAX, f32::MIN), |(a, b), &v| (a.min(v), b.max(v)));
         return Err(ShrinkError::Empty { min: f64::from(min), max: f64::from(max) }.into());
     };
@@ -112,10 +115,14 @@ pub fn contract(scene: &Sampler<'_>, resolution: Resolution) -> Result<Front, Re
         *v = (f64::from(*v) / (slope * frame.scale)) as f32;
     }
     let sampler = scene.framed(frame);
-    let thin = if resolution.probe { thin_walls(&sampler, &grid)? } else { Vec::new() };
+    let walls = if resolution.probe { thin(&sampler, &grid, Thin::Wall)? } else { Vec::new() };
+    let gaps = thin(&sampler, &grid, Thin::Gap)?;
     let mut target = grid.values.clone();
-    for &(i, _) in &thin {
-        target[i] = target[i].min(-f32::MIN_POSITIVE);
+    for &(i, _) in &walls {
+        target[i] = -f32::MIN_POSITIVE;
+    }
+    for &(i, _) in &gaps {
+        target[i] = f32::MIN_POSITIVE;
     }
     let inside = carve(&grid, &target, settings.cancel)?;
 
@@ -125,7 +132,8 @@ pub fn contract(scene: &Sampler<'_>, resolution: Resolution) -> Result<Front, Re
         let certain = f64::from(stuck) > CERTAIN * grid.h;
         topology::explain(&grid, &target, &inside, limit, frame).map_err(|error| Refusal { error, certain })?;
     }
-    let moved: HashMap<usize, DVec3> = thin.into_iter().filter(|&(i, _)| inside[i]).collect();
+    let walls = walls.into_iter().filter(|&(i, _)| inside[i]);
+    let moved = embedded(&grid, walls.chain(gaps.into_iter().filter(|&(i, _)| !inside[i])).collect());
     let mesh = extract(&grid, &inside, &moved, settings.cancel)?;
     Ok(Front { mesh, frame })
 }
@@ -143,24 +151,37 @@ fn reach(grid: &Grid3, slope: f64, last: bool) -> f64 {
     slope * diagonal * if last { REACH.1 } else { REACH.0 }
 }
 
-/// Nodes just outside a wall thinner than the lattice can hold, with the place just under the wall's surface that stands
-/// for them. The lattice's own values rule out most nodes before the field is asked.
-fn thin_walls(sampler: &Sampler<'_>, grid: &Grid3) -> Result<Vec<(usize, DVec3)>, Canceled> {
+/// Which side of the surface is looked at for being thinner than the lattice can hold.
+#[derive(Clone, Copy, PartialEq)]
+enum Thin {
+    /// Walls: nodes just outside one.
+    Wall,
+    /// Gaps: nodes just inside the solid beside one.
+    Gap,
+}
+
+/// Nodes beside a wall or a gap thinner than the lattice can hold, with the place just beyond the surface that stands for
+/// them once they count as belonging to it. The lattice's own values rule out most nodes before the field is asked.
+fn thin(sampler: &Sampler<'_>, grid: &Grid3, what: Thin) -> Result<Vec<(usize, DVec3)>, Canceled> {
     /// Interpolation across a cell can be this wrong, in spacings.
     const SLACK: f64 = 0.3;
+    /// The solid beside a gap is at least this thick, in spacings: nothing is opened into a thin wall.
+    const BACKED: f64 = 1.5;
     let h = grid.h;
+    // seen from the other side a gap is a wall
+    let sign = if what == Thin::Wall { 1.0 } else { -1.0 };
     let mut nodes = Vec::new();
     for i in 0..grid.len() {
-        let value = f64::from(grid.values[i]);
+        let value = sign * f64::from(grid.values[i]);
         if !grid.known[i] || value <= 0.0 || value > THIN * h || grid.on_border(i) {
             continue;
         }
         let difference = |axis: usize| {
             let stride = [grid.nodes[1] * grid.nodes[2], grid.nodes[2], 1][axis];
-            f64::from(grid.values[i + stride] - grid.values[i - stride])
+            sign * f64::from(grid.values[i + stride] - grid.values[i - stride])
         };
         let downhill = DVec3::new(difference(0), difference(1), difference(2)).normalize_or_zero();
-        let below = grid.interpolate(grid.position(i) - downhill * (value + PROBE * h));
+        let below = grid.interpolate(grid.position(i) - downhill * (value + PROBE * h)).map(|b| sign * b);
         if downhill == DVec3::ZERO || below.is_none_or(|b| b > -(SOLID + SLACK) * h) {
             nodes.push(i);
         }
@@ -171,15 +192,56 @@ fn thin_walls(sampler: &Sampler<'_>, grid: &Grid3) -> Result<Vec<(usize, DVec3)>
     let mut probes = Vec::with_capacity(nodes.len());
     for k in 0..nodes.len() {
         let steep = gradients[k].length().max(1e-9);
-        let (normal, distance) = (gradients[k] / steep, (values[k] / steep).min(THIN * h));
+        let (normal, distance) = (sign * gradients[k] / steep, (sign * values[k] / steep).min(THIN * h));
         feet.push(points[k] - normal * (distance + 0.05 * h));
         probes.push(points[k] - normal * (distance + PROBE * h));
     }
     let below = sampler.values(&probes)?;
-    Ok((0..nodes.len())
-        .filter(|&k| below[k] > -SOLID * h * gradients[k].length().max(1e-9))
-        .map(|k| (nodes[k], feet[k]))
-        .collect())
+    let is_thin = |k: usize| {
+        let steep = gradients[k].length().max(1e-9);
+        let behind = || grid.interpolate(points[k] - gradients[k] * (BACKED * h / steep));
+        sign * below[k] > -SOLID * h * steep && (what == Thin::Wall || behind().is_some_and(|b| b < -SOLID * h))
+    };
+    Ok((0..nodes.len()).filter(|&k| is_thin(k)).map(|k| (nodes[k], feet[k])).collect())
+}
+
+/// The moves of nodes, each shortened until no tetrahedron around it turns inside out, so that the front stays embedded.
+fn embedded(grid: &Grid3, moves: Vec<(usize, DVec3)>) -> HashMap<usize, DVec3> {
+    /// A tetrahedron keeps this share of its volume.
+    const SHARE: f64 = 0.05;
+    /// Rounds of shortening; what is left after them does not move.
+    const ROUNDS: usize = 12;
+    let least = SHARE * grid.h.powi(3);
+    let mut moved: HashMap<usize, DVec3> = moves.iter().copied().collect();
+    for round in 0..=ROUNDS {
+        let place = |i: usize| moved.get(&i).copied().unwrap_or_else(|| grid.position(i));
+        let squeezed = |&&(i, _): &&(usize, DVec3)| {
+            (0..4).any(|k| {
+                ORDERS.iter().enumerate().any(|(n, order)| {
+                    let sign = if n % 2 == 0 { 1.0 } else { -1.0 };
+                    let strides = order.map(|axis| grid.stride(NEIGHBOURS[axis]) as usize);
+                    let mut node = i - strides[..k].iter().sum::<usize>();
+                    let mut corners = [place(node); 4];
+                    for c in 1..4 {
+                        node += strides[c - 1];
+                        corners[c] = place(node);
+                    }
+                    let [a, b, c] = [1, 2, 3].map(|j| corners[j] - corners[0]);
+                    a.cross(b).dot(c) * sign < least
+                })
+            })
+        };
+        let list: Vec<(usize, DVec3)> = moves.iter().filter(squeezed).copied().collect();
+        if list.is_empty() {
+            break;
+        }
+        for (i, _) in list {
+            let here = grid.position(i);
+            let now = moved[&i];
+            moved.insert(i, if round == ROUNDS { here } else { here.lerp(now, 0.6) });
+        }
+    }
+    moved
 }
 
 /// For every set of inside neighbours (a bit each) whether the node between them is simple.
@@ -267,7 +329,6 @@ fn extract(
     moved: &HashMap<usize, DVec3>,
     cancel: &CancelToken,
 ) -> Result<Mesh, Canceled> {
-    const ORDERS: [[usize; 3]; 6] = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
     /// An edge's vertex keeps this share of the edge from either end, so that no triangle vanishes.
     const EDGE: f64 = 0.05;
     let strides = [grid.nodes[1] * grid.nodes[2], grid.nodes[2], 1];
@@ -307,6 +368,9 @@ fn extract(
                             } else if sa > 0.0 {
                                 // kept inside although the field is positive: stay close to the node
                                 0.3
+                            } else if sb <= 0.0 {
+                                // given up although the field is not positive
+                                0.7
                             } else {
                                 0.5
                             };

@@ -140,16 +140,20 @@ impl Grid3 {
         Some(sum)
     }
 
-    /// Box of the nodes that are not outside, grown by one spacing; `None` when all nodes are outside.
-    pub fn solid_box(&self) -> Option<(DVec3, DVec3)> {
+    /// Box of the nodes that the solid may reach: those not farther outside than half a cell's diagonal, where values change
+    /// by `slope` per length; grown by one spacing. `None` when no node is inside.
+    pub fn solid_box(&self, slope: f64) -> Option<(DVec3, DVec3)> {
+        let near = 0.5 * 3f64.sqrt() * self.h * slope;
         let mut bounds: Option<(DVec3, DVec3)> = None;
+        let mut any = false;
         for i in 0..self.len() {
-            if self.values[i] <= 0.0 {
+            any |= self.values[i] <= 0.0;
+            if f64::from(self.values[i]) <= near {
                 let p = self.position(i);
                 bounds = Some(bounds.map_or((p, p), |(lo, hi)| (lo.min(p), hi.max(p))));
             }
         }
-        bounds.map(|(lo, hi)| (lo - self.h, hi + self.h))
+        bounds.filter(|_| any).map(|(lo, hi)| (lo - self.h, hi + self.h))
     }
 
     /// Change of value per length that 95 % of the lattice edges through the zero level set stay below; of all edges

@@ -256,19 +256,17 @@ impl Mesh {
         true
     }
 
-    /// Moves every vertex towards its target, each step shortened until no triangle turns by more than acos(`turn`).
-    pub fn move_towards(&mut self, targets: &[DVec3], turn: f64) {
-        for (v, target) in targets.iter().enumerate() {
-            let from = self.positions[v];
-            let mut step = 1.0;
-            for _ in 0..4 {
-                let to = from + step * (target - from);
-                if self.may_move(v as u32, to, None, turn) {
-                    self.positions[v] = to;
-                    break;
-                }
-                step *= 0.4;
+    /// Moves `v` towards `target`, the step shortened until no triangle turns by more than acos(`turn`).
+    pub fn move_vertex(&mut self, v: u32, target: DVec3, turn: f64) {
+        let from = self.positions[v as usize];
+        let mut step = 1.0;
+        for _ in 0..4 {
+            let to = from + step * (target - from);
+            if self.may_move(v, to, None, turn) {
+                self.positions[v as usize] = to;
+                break;
             }
+            step *= 0.4;
         }
     }
 }

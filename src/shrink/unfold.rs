@@ -173,3 +173,13 @@ pub fn smooth(positions: &mut [DVec3], triangles: &[[u32; 3]], corners: &Corners
         positions[v] = positions[v].lerp(mean, step);
     }
 }
+
+/// Adds the mean of the corners' normals to the targets of the triangles that `mask` touches.
+pub fn mix_targets(targets: &mut [DVec3], triangles: &[[u32; 3]], mask: &[bool], normals: &[DVec3]) {
+    for (t, target) in triangles.iter().zip(targets) {
+        if t.iter().any(|&v| mask[v as usize]) {
+            let mean = t.iter().map(|&v| normals[v as usize]).sum::<DVec3>().normalize_or_zero();
+            *target = (*target + mean).normalize_or(mean);
+        }
+    }
+}

@@ -1,9 +1,8 @@
 //! Takes the last folds out of a lattice on the zero level set: first by relaxing patches around them, then by moving
 //! single vertices.
 
-use super::base::mix_targets;
 use super::energy::Reference;
-use super::unfold::{Corners, Problem, grow, relax, smooth};
+use super::unfold::{Corners, Problem, grow, mix_targets, relax, smooth};
 use super::zero::{OnZero, step_to_zero};
 use crate::field::Sampler;
 use crate::settings::Canceled;

@@ -13,6 +13,42 @@ pub fn step_to_zero(value: f64, gradient: DVec3, reach: f64) -> DVec3 {
     (gradient * (-value / squared)).clamp_length_max(reach)
 }
 
+/// Where points with the outward normals of a surface go on the zero level set: the Newton step, unless the gradient belongs
+/// to another sheet, across a narrow gap or through a thin wall. Such a point goes along its normal to the nearest place
+/// where the field changes from inside to outside, or stays when there is none within `reach`.
+pub fn own_sheet(
+    sampler: &Sampler<'_>,
+    points: &[DVec3],
+    normals: &[DVec3],
+    reach: f64,
+) -> Result<Vec<DVec3>, Canceled> {
+    /// A gradient that agrees with the normal less than this belongs to another sheet.
+    const OWN: f64 = 0.1;
+    /// Samples along the normal on either side.
+    const SAMPLES: usize = 8;
+    let (values, gradients) = sampler.gradients(points)?;
+    let (mut targets, mut strayed) = (Vec::with_capacity(points.len()), Vec::new());
+    for i in 0..points.len() {
+        if gradients[i].dot(normals[i]) < OWN * gradients[i].length() {
+            strayed.push(i);
+        }
+        targets.push(points[i] + step_to_zero(values[i], gradients[i], reach));
+    }
+    let offset = |k: usize| reach * (k as f64 - SAMPLES as f64) / SAMPLES as f64;
+    let count = 2 * SAMPLES + 1;
+    let line: Vec<DVec3> =
+        strayed.iter().flat_map(|&i| (0..count).map(move |k| points[i] + offset(k) * normals[i])).collect();
+    let along = sampler.values(&line)?;
+    for (&i, s) in strayed.iter().zip(along.chunks_exact(count)) {
+        let crossing = |k: usize| {
+            (s[k] <= 0.0 && s[k + 1] > 0.0).then(|| offset(k) + (offset(k + 1) - offset(k)) * s[k] / (s[k] - s[k + 1]))
+        };
+        let nearest = (0..count - 1).filter_map(crossing).min_by(|a, b| a.abs().total_cmp(&b.abs()));
+        targets[i] = points[i] + nearest.unwrap_or(0.0) * normals[i];
+    }
+    Ok(targets)
+}
+
 /// Points on the zero level set with the field there.
 #[derive(Clone, Debug)]
 pub struct OnZero {
