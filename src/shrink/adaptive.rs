@@ -15,9 +15,6 @@ use crate::field::Sampler;
 use crate::settings::{Front, Progress};
 use glam::DVec3;
 
-/// Weight of area against angle in the sphere map.
-const BETA: f64 = 0.5;
-
 /// What one attempt works with.
 struct Attempt {
     resolution: Resolution,
@@ -39,7 +36,7 @@ pub fn run(sampler: &Sampler<'_>, spec: &ShrinkSpec, effort: &Effort) -> Result<
     let first = (effort.attempt as usize).min(ATTEMPTS.len() - 1);
     let mut refusal = None;
     for attempt in &ATTEMPTS[first..] {
-        match one(sampler, &lattice, attempt) {
+        match one(sampler, spec, &lattice, attempt) {
             Ok(wrap) => return Ok(wrap),
             Err(refused) if !refused.certain => refusal = Some(refused.error),
             Err(refused) => return Err(refused.error),
@@ -48,7 +45,7 @@ pub fn run(sampler: &Sampler<'_>, spec: &ShrinkSpec, effort: &Effort) -> Result<
     Err(refusal.unwrap_or(ShrinkError::Unmapped))
 }
 
-fn one(scene: &Sampler<'_>, lattice: &SphereLattice, attempt: &Attempt) -> Result<Wrap, Refusal> {
+fn one(scene: &Sampler<'_>, spec: &ShrinkSpec, lattice: &SphereLattice, attempt: &Attempt) -> Result<Wrap, Refusal> {
     let settings = *scene.settings();
     let (start, end) = attempt.share;
     let stage = |name: &'static str, done: f32, front: Option<Front>, energy: Option<f64>, flips: Option<u64>| {
@@ -73,7 +70,8 @@ fn one(scene: &Sampler<'_>, lattice: &SphereLattice, attempt: &Attempt) -> Resul
     let sampler = scene.framed(frame);
     let (mesh, folded) = base(front, attempt.base_vertices, &sampler)?;
     stage("map", 0.45, Some(show(&mesh.positions, mesh.rings.triangles())), None, Some(folded as u64));
-    let map = sphere_map(&mesh, &density(&mesh), BETA, settings.cancel)?.ok_or(ShrinkError::Unmapped)?;
+    let map = sphere_map(&mesh, &density(&mesh, spec.density), spec.distortion.objective(), &settings)?
+        .ok_or(ShrinkError::Unmapped)?;
     stage("resample", 0.75, None, Some(map.energy), None);
     let directions = orient(&mesh, &map.directions, lattice.spec);
     let landed = land(&mesh, &directions, lattice, settings.cancel)?;

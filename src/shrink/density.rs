@@ -1,6 +1,7 @@
 //! How densely the surface is to be sampled: evenly by area, and more where it is curved, so that tips and limbs keep
 //! their shape.
 
+use super::Density;
 use super::rings::Mesh;
 use glam::DVec3;
 
@@ -14,7 +15,10 @@ const POWER: f64 = 0.5;
 const ROUNDS: usize = 4;
 
 /// The density at every vertex, from 1 to [`RANGE`].
-pub fn density(mesh: &Mesh) -> Vec<f64> {
+pub fn density(mesh: &Mesh, kind: Density) -> Vec<f64> {
+    if kind == Density::Area {
+        return vec![1.0; mesh.positions.len()];
+    }
     let radius = (mesh.area() / (4.0 * std::f64::consts::PI)).sqrt();
     let n = mesh.positions.len() as u32;
     let normals: Vec<DVec3> = (0..n).map(|v| mesh.vertex_normal(v)).collect();
