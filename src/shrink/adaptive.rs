@@ -18,17 +18,28 @@ use glam::DVec3;
 /// What one attempt works with.
 struct Attempt {
     resolution: Resolution,
-    /// Base vertices for a lattice of the default size.
-    base_vertices: usize,
+    /// Factor on [`base_vertices`].
+    fineness: f64,
     /// Where its share of the progress starts and ends.
     share: (f32, f32),
 }
 
 const ATTEMPTS: [Attempt; 3] = [
-    Attempt { resolution: Resolution { levels: 3, probe: true }, base_vertices: 10_000, share: (0.0, 0.7) },
-    Attempt { resolution: Resolution { levels: 4, probe: true }, base_vertices: 20_000, share: (0.7, 0.9) },
-    Attempt { resolution: Resolution { levels: 4, probe: false }, base_vertices: 20_000, share: (0.9, 1.0) },
+    Attempt { resolution: Resolution { levels: 3, probe: true }, fineness: 1.0, share: (0.0, 0.7) },
+    Attempt { resolution: Resolution { levels: 4, probe: true }, fineness: 2.0, share: (0.7, 0.9) },
+    Attempt { resolution: Resolution { levels: 4, probe: false }, fineness: 2.0, share: (0.9, 1.0) },
 ];
+
+/// Vertices of the base surface that a lattice is sampled from: half as many as the default lattice has, and more slowly
+/// growing than the lattice, because what is finer than the base the field itself says.
+fn base_vertices(lattice: &SphereLattice) -> f64 {
+    /// Base vertices of a lattice of 20,000.
+    const USUAL: f64 = 10_000.0;
+    /// A coarser base loses limbs that the front has.
+    const FEWEST: f64 = 2_000.0;
+    const GROWTH: f64 = 0.6;
+    (USUAL * (lattice.directions.len() as f64 / 20_000.0).powf(GROWTH)).max(FEWEST)
+}
 
 /// Makes one attempt; a refusal that a finer lattice could see differently is looked at by the later ones.
 pub fn run(sampler: &Sampler<'_>, spec: &ShrinkSpec, effort: &Effort) -> Result<Wrap, ShrinkError> {
@@ -68,13 +79,13 @@ fn one(scene: &Sampler<'_>, spec: &ShrinkSpec, lattice: &SphereLattice, attempt:
     };
     stage("remesh", 0.25, None, None, None);
     let sampler = scene.framed(frame);
-    let (mesh, folded) = base(front, attempt.base_vertices, &sampler)?;
+    let (mesh, folded) = base(front, (attempt.fineness * base_vertices(lattice)) as usize, &sampler)?;
     stage("map", 0.45, Some(show(&mesh.positions, mesh.rings.triangles())), None, Some(folded as u64));
-    let map = sphere_map(&mesh, &density(&mesh, spec.density), spec.distortion.objective(), &settings)?
+    let map = sphere_map(&mesh, &density(&mesh, spec.density, &settings), spec.distortion.objective(), &settings)?
         .ok_or(ShrinkError::Unmapped)?;
     stage("resample", 0.75, None, Some(map.energy), None);
-    let directions = orient(&mesh, &map.directions, lattice.spec);
-    let landed = land(&mesh, &directions, lattice, settings.cancel)?;
+    let directions = orient(&mesh, &map.directions, lattice.spec, &settings);
+    let landed = land(&mesh, &directions, lattice, &settings)?;
     let edge = (mesh.area() / lattice.directions.len() as f64).sqrt();
     let mut at = project(&sampler, landed.clone(), edge, 1e-3 * edge)?;
     stage("untangle", 0.85, None, None, None);

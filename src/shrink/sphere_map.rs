@@ -67,7 +67,9 @@ pub fn sphere_map(
     objective: Objective,
     settings: &Settings<'_>,
 ) -> Result<Option<SphereMap>, Canceled> {
-    Ok(map_and_descent(mesh, density, objective, settings)?.map(|(map, _)| map))
+    // one visit to the pool: its threads stay awake between the many short parallel loops
+    let result = settings.pool.install(|| map_and_descent(mesh, density, objective, settings))?;
+    Ok(result.map(|(map, _)| map))
 }
 
 /// The map, and how its last descent went.
