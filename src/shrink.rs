@@ -15,6 +15,7 @@ mod grid3;
 pub mod lattice;
 mod locate;
 mod paper;
+mod points;
 mod remesh;
 mod resample;
 mod rings;

@@ -15,23 +15,31 @@ use crate::field::Sampler;
 use crate::settings::{Front, Progress};
 use glam::DVec3;
 
-/// Weight of area against angle in the sphere map.
-const BETA: f64 = 0.5;
-
 /// What one attempt works with.
 struct Attempt {
     resolution: Resolution,
-    /// Base vertices for a lattice of the default size.
-    base_vertices: usize,
+    /// Factor on [`base_vertices`].
+    fineness: f64,
     /// Where its share of the progress starts and ends.
     share: (f32, f32),
 }
 
 const ATTEMPTS: [Attempt; 3] = [
-    Attempt { resolution: Resolution { levels: 3, probe: true }, base_vertices: 10_000, share: (0.0, 0.7) },
-    Attempt { resolution: Resolution { levels: 4, probe: true }, base_vertices: 20_000, share: (0.7, 0.9) },
-    Attempt { resolution: Resolution { levels: 4, probe: false }, base_vertices: 20_000, share: (0.9, 1.0) },
+    Attempt { resolution: Resolution { levels: 3, probe: true }, fineness: 1.0, share: (0.0, 0.7) },
+    Attempt { resolution: Resolution { levels: 4, probe: true }, fineness: 2.0, share: (0.7, 0.9) },
+    Attempt { resolution: Resolution { levels: 4, probe: false }, fineness: 2.0, share: (0.9, 1.0) },
 ];
+
+/// Vertices of the base surface that a lattice is sampled from: half as many as the default lattice has, and more slowly
+/// growing than the lattice, because what is finer than the base the field itself says.
+fn base_vertices(lattice: &SphereLattice) -> f64 {
+    /// Base vertices of a lattice of 20,000.
+    const USUAL: f64 = 10_000.0;
+    /// A coarser base loses limbs that the front has.
+    const FEWEST: f64 = 2_000.0;
+    const GROWTH: f64 = 0.6;
+    (USUAL * (lattice.directions.len() as f64 / 20_000.0).powf(GROWTH)).max(FEWEST)
+}
 
 /// Makes one attempt; a refusal that a finer lattice could see differently is looked at by the later ones.
 pub fn run(sampler: &Sampler<'_>, spec: &ShrinkSpec, effort: &Effort) -> Result<Wrap, ShrinkError> {
@@ -39,7 +47,7 @@ pub fn run(sampler: &Sampler<'_>, spec: &ShrinkSpec, effort: &Effort) -> Result<
     let first = (effort.attempt as usize).min(ATTEMPTS.len() - 1);
     let mut refusal = None;
     for attempt in &ATTEMPTS[first..] {
-        match one(sampler, &lattice, attempt) {
+        match one(sampler, spec, &lattice, attempt) {
             Ok(wrap) => return Ok(wrap),
             Err(refused) if !refused.certain => refusal = Some(refused.error),
             Err(refused) => return Err(refused.error),
@@ -48,7 +56,7 @@ pub fn run(sampler: &Sampler<'_>, spec: &ShrinkSpec, effort: &Effort) -> Result<
     Err(refusal.unwrap_or(ShrinkError::Unmapped))
 }
 
-fn one(scene: &Sampler<'_>, lattice: &SphereLattice, attempt: &Attempt) -> Result<Wrap, Refusal> {
+fn one(scene: &Sampler<'_>, spec: &ShrinkSpec, lattice: &SphereLattice, attempt: &Attempt) -> Result<Wrap, Refusal> {
     let settings = *scene.settings();
     let (start, end) = attempt.share;
     let stage = |name: &'static str, done: f32, front: Option<Front>, energy: Option<f64>, flips: Option<u64>| {
@@ -71,12 +79,13 @@ fn one(scene: &Sampler<'_>, lattice: &SphereLattice, attempt: &Attempt) -> Resul
     };
     stage("remesh", 0.25, Some(show(&front.mesh.positions, front.mesh.rings.triangles())), None, None);
     let sampler = scene.framed(frame);
-    let mesh = base(front, attempt.base_vertices, &sampler)?;
+    let mesh = base(front, (attempt.fineness * base_vertices(lattice)) as usize, &sampler)?;
     stage("map", 0.45, Some(show(&mesh.positions, mesh.rings.triangles())), None, None);
-    let map = sphere_map(&mesh, &density(&mesh), BETA, settings.cancel)?.ok_or(ShrinkError::Unmapped)?;
+    let map = sphere_map(&mesh, &density(&mesh, spec.density, &settings), spec.distortion.objective(), &settings)?
+        .ok_or(ShrinkError::Unmapped)?;
     stage("resample", 0.75, None, Some(map.energy), None);
-    let directions = orient(&mesh, &map.directions, lattice.spec);
-    let landed = land(&mesh, &directions, lattice, settings.cancel)?;
+    let directions = orient(&mesh, &map.directions, lattice.spec, &settings);
+    let landed = land(&mesh, &directions, lattice, &settings)?;
     let edge = (mesh.area() / lattice.directions.len() as f64).sqrt();
     let mut at = project(&sampler, landed.clone(), edge, 1e-3 * edge)?;
     stage("untangle", 0.85, None, None, None);

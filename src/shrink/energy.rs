@@ -33,7 +33,6 @@ impl Reference {
         }
     }
 
-
     /// Dirichlet energy per area: squared Frobenius norm of the Jacobian of the map that takes the reference to `x, b, c`.
     pub fn dirichlet(&self, x: DVec3, b: DVec3, c: DVec3) -> f64 {
         let [cx, cb, cc] = self.cotangents;
@@ -47,6 +46,73 @@ impl Reference {
     /// The factor of the identity that is the Hessian of [`Reference::dirichlet`] in `x`.
     pub fn dirichlet_hessian(&self) -> f64 {
         (self.cotangents[1] + self.cotangents[2]) / self.area
+    }
+}
+
+/// What a map is to keep, per area of a reference triangle, with T the Dirichlet energy per area and D the ratio of areas:
+/// `isometry` T (1 + D^-2) / 4 + `area` (D + 1/D) / 2 + `angle` T / (2 D). Each term is 1 for an isometry and infinite where
+/// a triangle loses its area. The first is a quarter of the symmetric Dirichlet energy (Smith and Schaefer 2015,
+/// "Bijective parameterization with free boundaries"), the last is MIPS (Hormann and Greiner 2000).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Objective {
+    /// Weight of lengths.
+    pub isometry: f64,
+    /// Weight of areas.
+    pub area: f64,
+    /// Weight of angles.
+    pub angle: f64,
+}
+
+/// An [`Objective`] and its derivatives by T and D; the second by T is zero.
+#[derive(Clone, Copy, Debug)]
+pub struct Derivatives {
+    /// The value.
+    pub value: f64,
+    /// By T.
+    pub by_t: f64,
+    /// By D.
+    pub by_d: f64,
+    /// By T and D.
+    pub by_td: f64,
+    /// By D twice.
+    pub by_dd: f64,
+}
+
+impl super::Distortion {
+    /// The weights that stand for it. None is only one term: areas alone leave the angles open, and angles alone give a
+    /// limb's tip less of the sphere than a lattice can sample.
+    pub fn objective(self) -> Objective {
+        match self {
+            Self::Area => Objective { isometry: 0.5, area: 8.0, angle: 0.0 },
+            Self::Angle => Objective { isometry: 0.1, area: 0.0, angle: 1.0 },
+            Self::Isometric => Objective { isometry: 1.0, area: 2.0, angle: 0.0 },
+        }
+    }
+}
+
+impl Objective {
+    /// Energy per area.
+    pub fn value(&self, t: f64, d: f64) -> f64 {
+        let inverse = 1.0 / d;
+        0.25 * self.isometry * t * (1.0 + inverse * inverse)
+            + 0.5 * self.area * (d + inverse)
+            + 0.5 * self.angle * t * inverse
+    }
+    /// Energy per area and its derivatives.
+    pub fn derivatives(&self, t: f64, d: f64) -> Derivatives {
+        let i1 = 1.0 / d;
+        let (i2, i3) = (i1 * i1, i1 * i1 * i1);
+        Derivatives {
+            value: 0.25 * self.isometry * t * (1.0 + i2) + 0.5 * self.area * (d + i1) + 0.5 * self.angle * t * i1,
+            by_t: 0.25 * self.isometry * (1.0 + i2) + 0.5 * self.angle * i1,
+            by_d: -0.5 * self.isometry * t * i3 + 0.5 * self.area * (1.0 - i2) - 0.5 * self.angle * t * i2,
+            by_td: -0.5 * self.isometry * i3 - 0.5 * self.angle * i2,
+            by_dd: 1.5 * self.isometry * t * i2 * i2 + self.area * i3 + self.angle * t * i3,
+        }
+    }
+    /// The value at an isometry: the sum of the weights.
+    pub fn ideal(&self) -> f64 {
+        self.isometry + self.area + self.angle
     }
 }
 

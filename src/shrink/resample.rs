@@ -4,24 +4,25 @@
 use super::lattice::{LatticeSpec, SphereLattice};
 use super::locate::locate;
 use super::rings::Mesh;
-use crate::settings::{CancelToken, Canceled};
+use crate::settings::{Canceled, Settings};
 use glam::{DMat3, DVec3};
+use rayon::prelude::*;
 use std::f64::consts::PI;
 
 /// The directions of a map turned so that a lattice's singular points lie where the surface is flat and evenly sampled.
 /// Only the lat-long lattice has such points.
-pub fn orient(mesh: &Mesh, directions: &[DVec3], spec: LatticeSpec) -> Vec<DVec3> {
+pub fn orient(mesh: &Mesh, directions: &[DVec3], spec: LatticeSpec, settings: &Settings<'_>) -> Vec<DVec3> {
     match spec {
         LatticeSpec::Octahedral { .. } => directions.to_vec(),
         LatticeSpec::Latlong { .. } => {
-            let turn = pole_rotation(mesh, directions);
+            let turn = pole_rotation(mesh, directions, settings);
             directions.iter().map(|&d| turn * d).collect()
         }
     }
 }
 
 /// The rotation that takes the best axis to z: over both polar caps the surface's normals agree and its area is even.
-fn pole_rotation(mesh: &Mesh, directions: &[DVec3]) -> DMat3 {
+fn pole_rotation(mesh: &Mesh, directions: &[DVec3], settings: &Settings<'_>) -> DMat3 {
     /// Half opening of a cap.
     const CAP: f64 = 10.0 * PI / 180.0;
     /// Axes tried.
@@ -66,15 +67,14 @@ fn pole_rotation(mesh: &Mesh, directions: &[DVec3]) -> DMat3 {
             .fold(0.0, f64::max)
     };
     // a spiral of even density (Fibonacci)
-    let axis = (0..AXES)
-        .map(|i| {
-            let z = 1.0 - (i as f64 + 0.5) / AXES as f64;
-            let (angle, radius) = (PI * (1.0 + 5f64.sqrt()) * (i as f64 + 0.5), (1.0 - z * z).sqrt());
-            DVec3::new(angle.cos() * radius, angle.sin() * radius, z)
-        })
-        .map(|axis| (score(axis), axis))
-        .min_by(|a, b| a.0.total_cmp(&b.0))
-        .map_or(DVec3::Z, |best| best.1);
+    let scored = |i: usize| {
+        let z = 1.0 - (i as f64 + 0.5) / AXES as f64;
+        let (angle, radius) = (PI * (1.0 + 5f64.sqrt()) * (i as f64 + 0.5), (1.0 - z * z).sqrt());
+        let axis = DVec3::new(angle.cos() * radius, angle.sin() * radius, z);
+        (score(axis), axis)
+    };
+    let scores: Vec<(f64, DVec3)> = settings.pool.install(|| (0..AXES).into_par_iter().map(scored).collect());
+    let axis = scores.into_iter().min_by(|a, b| a.0.total_cmp(&b.0)).map_or(DVec3::Z, |best| best.1);
     let (x, y) = super::energy::tangents(axis);
     DMat3::from_cols(x, y, axis).transpose()
 }
@@ -84,8 +84,8 @@ pub fn land(
     mesh: &Mesh,
     directions: &[DVec3],
     lattice: &SphereLattice,
-    cancel: &CancelToken,
+    settings: &Settings<'_>,
 ) -> Result<Vec<DVec3>, Canceled> {
-    let places = locate(mesh, directions, &lattice.directions, cancel)?;
+    let places = locate(mesh, directions, &lattice.directions, settings)?;
     Ok(places.into_iter().map(|(t, w)| (0..3).map(|c| w[c] * mesh.positions[t[c] as usize]).sum()).collect())
 }

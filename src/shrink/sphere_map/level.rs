@@ -1,0 +1,189 @@
+//! The map of one mesh as flat arrays: sweeps by colour, in parallel.
+//!
+//! Vertices of one colour share no triangle, so each of them can take its step without knowing the others': the result
+//! does not depend on who computes which, and no triangle turns over.
+
+use super::super::energy::{Objective, Reference};
+use super::star::Star;
+use crate::settings::{Canceled, Settings};
+use glam::DVec3;
+use rayon::prelude::*;
+
+/// Vertices per piece of parallel work; fixed, so that sums do not depend on the number of threads.
+pub const CHUNK: usize = 512;
+/// Meshes below this many vertices are not worth waking threads for.
+pub const PARALLEL: usize = 4096;
+
+/// Connectivity and references of a mesh, rings in one array.
+pub struct Level {
+    /// Number in the whole mesh of every vertex here.
+    pub vertices: Vec<u32>,
+    /// Where every vertex's ring starts; one longer than `vertices`.
+    pub first: Vec<u32>,
+    /// Rings, in numbers of this level.
+    pub ring: Vec<u32>,
+    /// Reference of the triangle between a ring's entry and the next one, seen from the ring's vertex.
+    pub references: Vec<Reference>,
+    /// Vertices by colour.
+    colours: Vec<Vec<u32>>,
+}
+
+impl Level {
+    /// From the rings of the vertices that are there, and the reference triangle of any three of them (numbers of the whole
+    /// mesh).
+    pub fn new<'a>(
+        vertices: Vec<u32>,
+        size: usize,
+        ring_of: impl Fn(u32) -> &'a [u32],
+        reference: impl Fn([u32; 3]) -> Reference + Sync,
+        settings: &Settings<'_>,
+    ) -> Self {
+        let mut number = vec![u32::MAX; size];
+        for (i, &v) in vertices.iter().enumerate() {
+            number[v as usize] = i as u32;
+        }
+        let (mut first, mut ring) = (Vec::with_capacity(vertices.len() + 1), Vec::with_capacity(6 * vertices.len()));
+        first.push(0);
+        for &v in &vertices {
+            ring.extend(ring_of(v).iter().map(|&u| number[u as usize]));
+            first.push(ring.len() as u32);
+        }
+        let mut level = Self { vertices, first, ring, references: Vec::new(), colours: Vec::new() };
+        level.references = level.map_rows(settings, |v, out| {
+            let (here, ring) = (level.vertices[v], level.ring(v));
+            for i in 0..ring.len() {
+                let (b, c) = (ring[i] as usize, ring[(i + 1) % ring.len()] as usize);
+                out.push(reference([here, level.vertices[b], level.vertices[c]]));
+            }
+        });
+        level.colour();
+        level
+    }
+
+    /// Number of vertices.
+    pub fn len(&self) -> usize {
+        self.vertices.len()
+    }
+    /// Neighbours of `v`, counter-clockwise.
+    pub fn ring(&self, v: usize) -> &[u32] {
+        &self.ring[self.range(v)]
+    }
+    /// Where the ring of `v` is in the flat arrays.
+    pub fn range(&self, v: usize) -> std::ops::Range<usize> {
+        self.first[v] as usize..self.first[v + 1] as usize
+    }
+
+    /// The other two corners of every triangle of `v`, in the ring's order.
+    pub fn wedges(&self, v: usize) -> impl Iterator<Item = [usize; 2]> {
+        let ring = self.ring(v);
+        (0..ring.len()).map(|i| [ring[i] as usize, ring[(i + 1) % ring.len()] as usize])
+    }
+
+    /// The first colour that no neighbour has, vertex by vertex.
+    fn colour(&mut self) {
+        let mut colours = vec![u32::MAX; self.len()];
+        // the last vertex that saw a colour in its ring
+        let mut seen: Vec<u32> = Vec::new();
+        for v in 0..self.len() {
+            for &u in &self.ring[self.range(v)] {
+                if let Some(seen) = seen.get_mut(colours[u as usize] as usize) {
+                    *seen = v as u32;
+                }
+            }
+            let free = seen.iter().position(|&by| by != v as u32).unwrap_or(seen.len());
+            if free == seen.len() {
+                seen.push(u32::MAX);
+                self.colours.push(Vec::new());
+            }
+            colours[v] = free as u32;
+            self.colours[free].push(v as u32);
+        }
+    }
+
+    /// Lists made for every vertex, one after the other.
+    pub fn map_rows<T: Send>(&self, settings: &Settings<'_>, row: impl Fn(usize, &mut Vec<T>) + Sync) -> Vec<T> {
+        let piece = |start: usize| {
+            let end = (start + CHUNK).min(self.len());
+            let mut out = Vec::with_capacity((self.first[end] - self.first[start]) as usize);
+            for v in start..end {
+                row(v, &mut out);
+            }
+            out
+        };
+        let starts = || (0..self.len()).step_by(CHUNK);
+        if self.len() < PARALLEL {
+            return starts().flat_map(piece).collect();
+        }
+        let starts: Vec<usize> = starts().collect();
+        let pieces: Vec<Vec<T>> = settings.pool.install(|| starts.into_par_iter().map(piece).collect());
+        pieces.into_iter().flatten().collect()
+    }
+
+    /// A sum over all vertices, in a fixed order.
+    pub fn sum(&self, settings: &Settings<'_>, term: impl Fn(usize) -> f64 + Sync) -> f64 {
+        let piece = |start: usize| (start..(start + CHUNK).min(self.len())).map(&term).sum::<f64>();
+        let starts = (0..self.len()).step_by(CHUNK);
+        if self.len() < PARALLEL {
+            return starts.map(piece).sum();
+        }
+        let starts: Vec<usize> = starts.collect();
+        let pieces: Vec<f64> = settings.pool.install(|| starts.into_par_iter().map(piece).collect());
+        pieces.into_iter().sum()
+    }
+
+    fn gather(&self, v: usize, places: &[DVec3], star: &mut Star) {
+        star.clear();
+        let (ring, references) = (self.ring(v), &self.references[self.range(v)]);
+        for i in 0..ring.len() {
+            let (b, c) = (ring[i] as usize, ring[(i + 1) % ring.len()] as usize);
+            star.push(places[b], places[c], &references[i]);
+        }
+    }
+
+    /// Energy of the whole map; infinite where a triangle is not positive.
+    pub fn energy(&self, places: &[DVec3], objective: &Objective, settings: &Settings<'_>) -> f64 {
+        // every triangle is counted at its corner of the smallest number
+        self.sum(settings, |v| {
+            let (ring, references, x) = (self.ring(v), &self.references[self.range(v)], places[v]);
+            let mut sum = 0.0;
+            for i in 0..ring.len() {
+                let (b, c) = (ring[i] as usize, ring[(i + 1) % ring.len()] as usize);
+                if v < b && v < c {
+                    let (b, c) = (places[b], places[c]);
+                    let d = x.dot(b.cross(c)) / (2.0 * references[i].area);
+                    if d.is_nan() || d <= 1e-14 {
+                        return f64::INFINITY;
+                    }
+                    sum += references[i].area * objective.value(references[i].dirichlet(x, b, c), d);
+                }
+            }
+            sum
+        })
+    }
+
+    /// One sweep of Newton steps over all vertices, colour by colour; returns by how much the energy fell.
+    pub fn sweep(&self, places: &mut [DVec3], objective: &Objective, settings: &Settings<'_>) -> Result<f64, Canceled> {
+        let mut fallen = 0.0;
+        for colour in &self.colours {
+            settings.cancel.check()?;
+            let relax = |star: &mut Star, v: u32| {
+                self.gather(v as usize, places, star);
+                star.relax(places[v as usize], objective)
+            };
+            let steps: Vec<Option<(DVec3, f64)>> = if self.len() < PARALLEL || colour.len() < 2 * CHUNK {
+                let mut star = Star::default();
+                colour.iter().map(|&v| relax(&mut star, v)).collect()
+            } else {
+                let work = colour.par_iter().with_min_len(CHUNK);
+                settings.pool.install(|| work.map_init(Star::default, |star, &v| relax(star, v)).collect())
+            };
+            for (&v, step) in colour.iter().zip(steps) {
+                if let Some((to, gain)) = step {
+                    places[v as usize] = to;
+                    fallen += gain;
+                }
+            }
+        }
+        Ok(fallen)
+    }
+}

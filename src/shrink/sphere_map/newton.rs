@@ -1,0 +1,388 @@
+//! The second-order finish: truncated Newton steps of the whole map at once, with conjugate gradients inside (Nocedal and
+//! Wright 2006, "Numerical optimization", algorithm 7.1), on the product of unit spheres.
+//!
+//! Vertex sweeps take rough errors away and leave smooth ones; a Newton step sees the whole map and takes both. The energy
+//! is infinite where a triangle is not positive, so the line search keeps the bijection.
+
+use super::super::energy::{Objective, Reference, tangents};
+use super::level::{CHUNK, Level, PARALLEL};
+use crate::settings::{Canceled, Settings};
+use glam::{DMat2, DVec2, DVec3};
+use rayon::prelude::*;
+
+/// When to stop a descent.
+#[derive(Clone, Copy, Debug)]
+pub struct Effort {
+    /// Newton steps at most.
+    pub steps: usize,
+    /// Products with the Hessian in each, at most.
+    pub products: usize,
+    /// Share of the energy that may be left to gain.
+    pub tolerance: f64,
+}
+
+/// How a descent went.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Descent {
+    /// Newton steps taken.
+    pub steps: usize,
+    /// Products with the Hessian.
+    pub products: usize,
+    /// Energy at the end.
+    pub energy: f64,
+    /// Half the last step's slope over the energy: about the share of the energy that was still to be gained.
+    pub decrement: f64,
+}
+
+/// The Hessian at a map, in tangent coordinates: a 2 x 2 block per vertex and per edge, and the gradient.
+struct System {
+    frames: Vec<[DVec3; 2]>,
+    gradient: Vec<DVec2>,
+    diagonal: Vec<DMat2>,
+    /// Blocks of every vertex against its ring, in the ring's order.
+    edges: Vec<DMat2>,
+    /// Inverses of the diagonal blocks with their eigenvalues made positive.
+    inverse: Vec<DMat2>,
+}
+
+/// Takes Newton steps until the energy that is left to gain is small, each followed by a sweep of vertex steps. The energy
+/// never rises.
+pub fn descend(
+    level: &Level,
+    places: &mut Vec<DVec3>,
+    objective: &Objective,
+    effort: Effort,
+    settings: &Settings<'_>,
+) -> Result<Descent, Canceled> {
+    let mut descent = Descent { energy: level.energy(places, objective, settings), ..Descent::default() };
+    for _ in 0..effort.steps {
+        settings.cancel.check()?;
+        let system = System::new(level, places, objective, settings);
+        let (direction, used) = system.solve(level, effort.products, settings)?;
+        descent.products += used;
+        let slope: f64 = level.sum(settings, |v| system.gradient[v].dot(direction[v]));
+        descent.decrement = -0.5 * slope / descent.energy;
+        if slope.is_nan() || slope >= 0.0 || descent.decrement < effort.tolerance {
+            break;
+        }
+        let Some((to, energy)) = search(level, places, &system, &direction, descent.energy, objective, settings) else {
+            break;
+        };
+        *places = to;
+        descent.energy = energy;
+        descent.steps += 1;
+        // a step may leave single triangles nearly flat, and only vertex steps see them
+        descent.energy -= level.sweep(places, objective, settings)?;
+    }
+    Ok(descent)
+}
+
+/// Backtracking from the full step. Before the energy is asked, vertices of triangles that the step would all but flatten
+/// take half of it, again and again: few triangles must not hold the whole map back.
+fn search(
+    level: &Level,
+    places: &[DVec3],
+    system: &System,
+    direction: &[DVec2],
+    energy: f64,
+    objective: &Objective,
+    settings: &Settings<'_>,
+) -> Option<(Vec<DVec3>, f64)> {
+    /// A triangle keeps at least this share of its determinant.
+    const KEPT: f64 = 0.1;
+    /// Rounds of local halving.
+    const ROUNDS: usize = 8;
+    let mut fractions = vec![1.0f64; level.len()];
+    let step = |fractions: &[f64]| -> Vec<DVec3> {
+        let to = |v: usize| {
+            let [e1, e2] = system.frames[v];
+            (places[v] + fractions[v] * (direction[v].x * e1 + direction[v].y * e2)).normalize_or_zero()
+        };
+        (0..level.len()).map(to).collect()
+    };
+    for _ in 0..10 {
+        let mut to = step(&fractions);
+        for _ in 0..ROUNDS {
+            let flat = |v: usize, b: usize, c: usize| {
+                let after = to[v].dot(to[b].cross(to[c]));
+                after.is_nan() || after < KEPT * places[v].dot(places[b].cross(places[c]))
+            };
+            let squeezed: Vec<u32> = level.map_rows(settings, |v, out| {
+                if level.wedges(v).any(|[b, c]| flat(v, b, c)) {
+                    out.push(v as u32);
+                }
+            });
+            if squeezed.is_empty() {
+                break;
+            }
+            for &v in &squeezed {
+                fractions[v as usize] *= 0.5;
+            }
+            to = step(&fractions);
+        }
+        let after = level.energy(&to, objective, settings);
+        if after < energy {
+            return Some((to, after));
+        }
+        fractions.iter_mut().for_each(|f| *f *= 0.5);
+    }
+    None
+}
+
+impl System {
+    fn new(level: &Level, places: &[DVec3], objective: &Objective, settings: &Settings<'_>) -> Self {
+        let frames: Vec<[DVec3; 2]> = places.iter().map(|&x| tangents(x).into()).collect();
+        let triangles = level.map_rows(settings, |v, out: &mut Vec<Triangle>| {
+            for (i, [b, c]) in level.wedges(v).enumerate().filter(|&(_, [b, c])| v < b && v < c) {
+                let reference = &level.references[level.range(v)][i];
+                out.push(Triangle::new([v, b, c], places, &frames, reference, objective));
+            }
+        });
+        // the number of the first triangle of every vertex that is its triangles' smallest
+        let mut owned = vec![0u32; level.len() + 1];
+        for v in 0..level.len() {
+            owned[v + 1] = owned[v] + level.wedges(v).filter(|&[b, c]| v < b && v < c).count() as u32;
+        }
+        let find = |v: usize, b: usize, c: usize| -> (usize, usize) {
+            // the corner of the smallest vertex, and where `v` is counted from there
+            let (owner, next, corner) = if v < b && v < c {
+                (v, b, 0)
+            } else if b < c {
+                (b, c, 2)
+            } else {
+                (c, v, 1)
+            };
+            let before = level.wedges(owner).take_while(|w| w[0] != next).filter(|&[b, c]| owner < b && owner < c);
+            (owned[owner] as usize + before.count(), corner)
+        };
+        let rows = level.map_rows(settings, |v, out: &mut Vec<Row>| {
+            let mut row =
+                Row { gradient: DVec2::ZERO, diagonal: DMat2::ZERO, edges: vec![DMat2::ZERO; level.ring(v).len()] };
+            let mut inward = 0.0;
+            for (i, [b, c]) in level.wedges(v).enumerate() {
+                let (t, corner) = find(v, b, c);
+                let t = &triangles[t];
+                row.gradient += t.gradient[corner];
+                inward += t.inward[corner];
+                let next = (i + 1) % row.edges.len();
+                for mode in &t.modes {
+                    let [x, b, c] = [0, 1, 2].map(|k| mode[(corner + k) % 3]);
+                    row.diagonal += outer(x, x);
+                    row.edges[i] += outer(x, b);
+                    row.edges[next] += outer(x, c);
+                }
+            }
+            // the sphere's own curvature, where it does not bend the energy downwards
+            row.diagonal += DMat2::from_diagonal(DVec2::splat(inward.max(0.0)));
+            out.push(row);
+        });
+        let mut system = Self {
+            frames,
+            gradient: Vec::with_capacity(level.len()),
+            diagonal: Vec::with_capacity(level.len()),
+            edges: Vec::with_capacity(level.ring.len()),
+            inverse: Vec::with_capacity(level.len()),
+        };
+        for row in rows {
+            system.gradient.push(row.gradient);
+            system.inverse.push(inverse_positive(row.diagonal));
+            system.diagonal.push(row.diagonal);
+            system.edges.extend(row.edges);
+        }
+        system
+    }
+
+    /// Hessian times `p`.
+    fn product(&self, level: &Level, p: &[DVec2], out: &mut [DVec2], settings: &Settings<'_>) {
+        let piece = |k: usize, out: &mut [DVec2]| {
+            for (i, y) in out.iter_mut().enumerate() {
+                let v = k * CHUNK + i;
+                let range = level.range(v);
+                let mut sum = self.diagonal[v] * p[v];
+                for (m, &u) in self.edges[range.clone()].iter().zip(&level.ring[range]) {
+                    sum += *m * p[u as usize];
+                }
+                *y = sum;
+            }
+        };
+        if level.len() < PARALLEL {
+            out.chunks_mut(CHUNK).enumerate().for_each(|(k, out)| piece(k, out));
+        } else {
+            settings.pool.install(|| out.par_chunks_mut(CHUNK).enumerate().for_each(|(k, out)| piece(k, out)));
+        }
+    }
+
+    /// Conjugate gradients with the diagonal blocks as preconditioner, stopped early: where the residual is small enough
+    /// for the gradient that is left, or where the Hessian curves downwards.
+    fn solve(&self, level: &Level, products: usize, settings: &Settings<'_>) -> Result<(Vec<DVec2>, usize), Canceled> {
+        let n = level.len();
+        let mut x = vec![DVec2::ZERO; n];
+        let mut r: Vec<DVec2> = self.gradient.iter().map(|g| -*g).collect();
+        let mut z: Vec<DVec2> = r.iter().zip(&self.inverse).map(|(r, m)| *m * *r).collect();
+        let mut p = z.clone();
+        let mut q = vec![DVec2::ZERO; n];
+        let mut rz = level.sum(settings, |v| r[v].dot(z[v]));
+        let start = rz;
+        /// The residual's share at which a solution is good enough far from the minimum.
+        const FORCING: f64 = 0.05;
+        for k in 0..products {
+            settings.cancel.check()?;
+            self.product(level, &p, &mut q, settings);
+            let curvature = level.sum(settings, |v| p[v].dot(q[v]));
+            if curvature.is_nan() || curvature <= 0.0 {
+                return Ok((if k == 0 { p } else { x }, k + 1));
+            }
+            let alpha = rz / curvature;
+            for v in 0..n {
+                x[v] += alpha * p[v];
+                r[v] -= alpha * q[v];
+                z[v] = self.inverse[v] * r[v];
+            }
+            let next = level.sum(settings, |v| r[v].dot(z[v]));
+            if next <= FORCING * FORCING * start {
+                return Ok((x, k + 1));
+            }
+            let beta = next / rz;
+            rz = next;
+            for v in 0..n {
+                p[v] = z[v] + beta * p[v];
+            }
+        }
+        Ok((x, products))
+    }
+}
+
+/// One vertex's share of a [`System`].
+struct Row {
+    gradient: DVec2,
+    diagonal: DMat2,
+    edges: Vec<DMat2>,
+}
+
+/// u v^T.
+fn outer(u: DVec2, v: DVec2) -> DMat2 {
+    DMat2::from_cols(u * v.x, u * v.y)
+}
+
+/// One triangle's exact gradient, and its Hessian made positive as a sum of squares, in its corners' tangent coordinates.
+struct Triangle {
+    gradient: [DVec2; 3],
+    /// Minus the gradient's part along the corner's direction.
+    inward: [f64; 3],
+    /// The Hessian is the sum over modes of m m^T.
+    modes: [[DVec2; 3]; 4],
+}
+
+impl Triangle {
+    fn new(
+        corners: [usize; 3],
+        places: &[DVec3],
+        frames: &[[DVec3; 2]],
+        reference: &Reference,
+        objective: &Objective,
+    ) -> Self {
+        let p = corners.map(|v| places[v]);
+        let frame = corners.map(|v| frames[v]);
+        let [cx, cb, cc] = reference.cotangents;
+        let (area, half) = (reference.area, 0.5 / reference.area);
+        let by_place_d = [half * p[1].cross(p[2]), half * p[2].cross(p[0]), half * p[0].cross(p[1])];
+        let edge = |i: usize, j: usize, cot: f64| 2.0 * half * cot * (p[i] - p[j]);
+        let by_place_t =
+            [edge(0, 1, cc) + edge(0, 2, cb), edge(1, 0, cc) + edge(1, 2, cx), edge(2, 0, cb) + edge(2, 1, cx)];
+        let t = reference.dirichlet(p[0], p[1], p[2]);
+        let k = objective.derivatives(t, p[0].dot(by_place_d[0]));
+        let (mut gradient, mut inward) = ([DVec2::ZERO; 3], [0.0; 3]);
+        for i in 0..3 {
+            let g = area * (k.by_t * by_place_t[i] + k.by_d * by_place_d[i]);
+            gradient[i] = DVec2::new(frame[i][0].dot(g), frame[i][1].dot(g));
+            inward[i] = -g.dot(p[i]);
+        }
+
+        // the reference in its own plane: x at the origin, b along the first axis
+        let base = (2.0 * area * (cx + cb)).sqrt();
+        let apex = DVec2::new(2.0 * area * cx / base, 2.0 * area / base);
+        // gradients of the three hat functions there
+        let hat_b = DVec2::new(1.0, -apex.x / apex.y) / base;
+        let hat_c = DVec2::new(0.0, 1.0 / apex.y);
+        let hats = [-hat_b - hat_c, hat_b, hat_c];
+        // the triangle in its plane
+        let (ab, ac) = (p[1] - p[0], p[2] - p[0]);
+        let u1 = ab.normalize_or(frame[0][0]);
+        let across = ac - u1 * ac.dot(u1);
+        let u2 = across.normalize_or(frame[0][1]);
+        let (b, c) = (DVec2::new(ab.length(), 0.0), DVec2::new(ac.dot(u1), across.length()));
+        let jacobian = outer(b, hat_b) + outer(c, hat_c);
+        let modes = positive_modes(jacobian, area, objective).map(|mode| {
+            [0, 1, 2].map(|i| {
+                let m = mode * hats[i];
+                let m = m.x * u1 + m.y * u2;
+                DVec2::new(frame[i][0].dot(m), frame[i][1].dot(m))
+            })
+        });
+        Self { gradient, inward, modes }
+    }
+}
+
+/// The Hessian of the energy as a function of a planar Jacobian, times `area`, its negative eigenvalues left out: four
+/// matrices whose squares sum to it (Smith, de Goes and Kim 2019, "Analytic eigensystems for isotropic distortion
+/// energies", in the plane).
+fn positive_modes(jacobian: DMat2, area: f64, objective: &Objective) -> [DMat2; 4] {
+    /// No direction is taken for flatter than this share of the Dirichlet term's own curvature.
+    const FLAT: f64 = 0.02;
+    let [[a, c], [b, d]] = jacobian.to_cols_array_2d();
+    // a similarity of scale q and an anti-similarity of scale r
+    let similar = DVec2::new(a + d, c - b) * 0.5;
+    let mirror = DVec2::new(a - d, b + c) * 0.5;
+    let (q, r) = (similar.length(), mirror.length());
+    let (s1, s2) = (q + r, (q - r).max(1e-9 * q));
+    let k = objective.derivatives(s1 * s1 + s2 * s2, s1 * s2);
+    let (e, f) = (similar.normalize_or(DVec2::X), mirror.normalize_or(DVec2::X));
+    let root = 0.5f64.sqrt();
+    let conformal = |v: DVec2| DMat2::from_cols(DVec2::new(v.x, v.y), DVec2::new(-v.y, v.x)) * root;
+    let anticonformal = |v: DVec2| DMat2::from_cols(DVec2::new(v.x, v.y), DVec2::new(v.y, -v.x)) * root;
+    let twist = 2.0 * k.by_t + k.by_d;
+    let flip = 2.0 * k.by_t - k.by_d;
+    let (by_11, by_22) = (
+        2.0 * k.by_t + 4.0 * s1 * s2 * k.by_td + s2 * s2 * k.by_dd,
+        2.0 * k.by_t + 4.0 * s1 * s2 * k.by_td + s1 * s1 * k.by_dd,
+    );
+    let by_12 = k.by_d + 2.0 * (s1 * s1 + s2 * s2) * k.by_td + s1 * s2 * k.by_dd;
+    // in the basis of s1 + s2 and s1 - s2
+    let (plus, minus, mixed) = (0.5 * (by_11 + by_22) + by_12, 0.5 * (by_11 + by_22) - by_12, 0.5 * (by_11 - by_22));
+    let (mean, radius) = (0.5 * (plus + minus), (0.25 * (plus - minus) * (plus - minus) + mixed * mixed).sqrt());
+    let axis = if mixed.abs() > 1e-300 {
+        DVec2::new(mean + radius - minus, mixed).normalize_or(DVec2::X)
+    } else if plus >= minus {
+        DVec2::X
+    } else {
+        DVec2::Y
+    };
+    let scaling = |v: DVec2| v.x * conformal(e) + v.y * anticonformal(f);
+    let floor = FLAT * k.by_t;
+    let square = |value: f64| (area * value.max(floor)).sqrt();
+    [
+        square(twist) * conformal(e.perp()),
+        square(flip) * anticonformal(f.perp()),
+        square(mean + radius) * scaling(axis),
+        square(mean - radius) * scaling(axis.perp()),
+    ]
+}
+
+/// The inverse of a symmetric block with its eigenvalues made positive and none much smaller than the other.
+fn inverse_positive(m: DMat2) -> DMat2 {
+    const FLOOR: f64 = 1e-3;
+    let (a, b, c) = (m.x_axis.x, m.x_axis.y, m.y_axis.y);
+    let (mean, radius) = (0.5 * (a + c), (0.25 * (a - c) * (a - c) + b * b).sqrt());
+    let (large, small) = (mean + radius, mean - radius);
+    let floor = FLOOR * large.abs().max(small.abs()) + 1e-300;
+    let axis = if b.abs() > 1e-300 {
+        DVec2::new(large - c, b).normalize_or(DVec2::X)
+    } else if a >= c {
+        DVec2::X
+    } else {
+        DVec2::Y
+    };
+    let across = axis.perp();
+    let (l, s) = (1.0 / large.abs().max(floor), 1.0 / small.abs().max(floor));
+    DMat2::from_cols(l * axis * axis.x + s * across * across.x, l * axis * axis.y + s * across * across.y)
+}
