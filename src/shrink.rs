@@ -6,6 +6,7 @@
 
 mod adaptive;
 mod base;
+mod collide;
 mod contract;
 mod creases;
 pub mod curve;
@@ -19,6 +20,7 @@ mod points;
 mod remesh;
 mod resample;
 mod rings;
+mod separate;
 mod sphere_map;
 mod topology;
 mod unfold;
@@ -190,4 +192,16 @@ pub fn shrink(sampler: &Sampler<'_>, spec: &ShrinkSpec, effort: &Effort) -> Resu
         Method::Adaptive => adaptive::run(sampler, spec, effort),
         Method::Paper => paper::run(sampler, spec),
     }
+}
+
+/// Repairs a wrap that a certificate complained about: the triangles at `places` (scene units) are shown to the field,
+/// and what is folded or crosses anywhere is moved apart. Returns the folded triangles and the crossing pairs that are
+/// left, as far as they are seen.
+///
+/// # Errors
+/// When the token is raised.
+pub fn mend(sampler: &Sampler<'_>, wrap: &mut Wrap, places: &[DVec3]) -> Result<(usize, usize), Canceled> {
+    sampler.tally().stage("mend");
+    let left = separate::separate(sampler, wrap, &[], places)?;
+    Ok((left.folds, left.crossings))
 }

@@ -6,6 +6,7 @@ use super::creases::{choose_diagonals, snap};
 use super::density::density;
 use super::lattice::SphereLattice;
 use super::resample::{land, orient};
+use super::separate::separate;
 use super::sphere_map::sphere_map;
 use super::unfold::Corners;
 use super::untangle::Tangle;
@@ -47,7 +48,7 @@ pub fn run(sampler: &Sampler<'_>, spec: &ShrinkSpec, effort: &Effort) -> Result<
     let first = (effort.attempt as usize).min(ATTEMPTS.len() - 1);
     let mut refusal = None;
     for attempt in &ATTEMPTS[first..] {
-        match one(sampler, spec, &lattice, attempt) {
+        match one(sampler, spec, &lattice, attempt, &effort.places) {
             Ok(wrap) => return Ok(wrap),
             Err(refused) if !refused.certain => refusal = Some(refused.error),
             Err(refused) => return Err(refused.error),
@@ -56,7 +57,13 @@ pub fn run(sampler: &Sampler<'_>, spec: &ShrinkSpec, effort: &Effort) -> Result<
     Err(refusal.unwrap_or(ShrinkError::Unmapped))
 }
 
-fn one(scene: &Sampler<'_>, spec: &ShrinkSpec, lattice: &SphereLattice, attempt: &Attempt) -> Result<Wrap, Refusal> {
+fn one(
+    scene: &Sampler<'_>,
+    spec: &ShrinkSpec,
+    lattice: &SphereLattice,
+    attempt: &Attempt,
+    places: &[DVec3],
+) -> Result<Wrap, Refusal> {
     let settings = *scene.settings();
     let (start, end) = attempt.share;
     let stage = |name: &'static str, done: f32, front: Option<Front>, energy: Option<f64>, flips: Option<u64>| {
@@ -97,12 +104,21 @@ fn one(scene: &Sampler<'_>, spec: &ShrinkSpec, lattice: &SphereLattice, attempt:
         folds = tangle.move_single(&mut at)?;
     }
     stage("sharpen", 0.95, Some(show(&at.positions, triangles.clone())), None, Some(folds as u64));
+    let blunt = at.positions.clone();
     let (folds, at, diagonals) = sharpen(&sampler, lattice, (folds, at, diagonals))?;
-    let positions: Vec<DVec3> = at.positions.iter().map(|&p| frame.to_scene(p)).collect();
     let triangles = lattice.triangles(&diagonals);
-    stage("sharpen", 1.0, Some(show(&at.positions, triangles)), None, Some(folds as u64));
-    let values = at.values.iter().map(|s| s * frame.scale).collect();
-    Ok(Wrap { lattice: lattice.clone(), positions, values, gradients: at.gradients, diagonals })
+    stage("separate", 0.97, Some(show(&at.positions, triangles)), None, Some(folds as u64));
+    let to_scene = |list: &[DVec3]| -> Vec<DVec3> { list.iter().map(|&p| frame.to_scene(p)).collect() };
+    let mut wrap = Wrap {
+        lattice: lattice.clone(),
+        positions: to_scene(&at.positions),
+        values: at.values.iter().map(|s| s * frame.scale).collect(),
+        gradients: at.gradients,
+        diagonals,
+    };
+    let left = separate(scene, &mut wrap, &[&to_scene(&blunt), &to_scene(&landed)], places)?;
+    stage("separate", 1.0, None, None, Some(left.folds as u64));
+    Ok(wrap)
 }
 
 /// Moves vertices onto creases and turns diagonals along them; keeps what it was given where that folds more.

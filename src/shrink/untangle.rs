@@ -12,7 +12,7 @@ use glam::DVec3;
 const DOUBTFUL: f64 = 0.1;
 /// Triangles at most this far from opposing the field count as folded: a triangle across the mouth of a notch is
 /// perpendicular to the gradient, and rounding must not decide about it.
-const FOLD: f64 = 1e-3;
+pub const FOLD: f64 = 1e-3;
 
 /// The lattice surface while it is untangled.
 pub struct Tangle<'a> {
@@ -33,7 +33,7 @@ impl<'a> Tangle<'a> {
 
     /// Agreement of every triangle with the field at its centroid. The corners' gradients answer for triangles that no
     /// corner doubts; the field is asked about the others. Returns the field's unit normals too.
-    fn agreement(&self, at: &OnZero) -> Result<(Vec<f64>, Vec<DVec3>), Canceled> {
+    pub fn agreement(&self, at: &OnZero) -> Result<(Vec<f64>, Vec<DVec3>), Canceled> {
         /// A triangle that agrees this well with each of its corners is not folded, if the corners agree among themselves.
         const SURE: f64 = 0.35;
         /// Length of the mean of three unit normals above which they agree.
@@ -148,7 +148,7 @@ impl<'a> Tangle<'a> {
         /// Beyond this many folds single moves are hopeless.
         const HOPELESS: usize = 150;
         let (mut along, _) = self.agreement(at)?;
-        let mut random = Random(0x9e37_79b9_7f4a_7c15);
+        let mut random = Random::new();
         for round in 0..ROUNDS {
             let folded: Vec<usize> = (0..along.len()).filter(|&i| along[i] <= FOLD).collect();
             if folded.is_empty() || folded.len() > HOPELESS {
@@ -224,7 +224,8 @@ impl<'a> Tangle<'a> {
     }
 }
 
-fn masked(mask: &[bool]) -> Vec<u32> {
+/// Vertices that a mask holds.
+pub fn masked(mask: &[bool]) -> Vec<u32> {
     (0..mask.len() as u32).filter(|&v| mask[v as usize]).collect()
 }
 
@@ -238,9 +239,13 @@ fn centroid(positions: &[DVec3], t: [u32; 3]) -> DVec3 {
 }
 
 /// A small generator with a fixed seed (splitmix64, Steele et al. 2014), so that results do not change from run to run.
-struct Random(u64);
+pub struct Random(u64);
 
 impl Random {
+    /// From the one seed there is.
+    pub fn new() -> Self {
+        Self(0x9e37_79b9_7f4a_7c15)
+    }
     fn next(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;
@@ -248,14 +253,15 @@ impl Random {
         z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
         z ^ (z >> 31)
     }
-    fn below(&mut self, n: u64) -> usize {
+    /// A number below `n`.
+    pub fn below(&mut self, n: u64) -> usize {
         (self.next() % n) as usize
     }
     fn unit(&mut self) -> f64 {
         ((self.next() >> 11) as f64 + 0.5) / (1u64 << 53) as f64
     }
     /// Three independent normal numbers (Box and Muller).
-    fn normal(&mut self) -> DVec3 {
+    pub fn normal(&mut self) -> DVec3 {
         let mut one = || (-2.0 * self.unit().ln()).sqrt() * (2.0 * std::f64::consts::PI * self.unit()).cos();
         DVec3::new(one(), one(), one())
     }
