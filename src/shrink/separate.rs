@@ -37,6 +37,7 @@ impl Faults {
 }
 
 /// Where things are wrong.
+#[derive(Clone)]
 struct Found {
     pairs: Vec<(u32, u32)>,
     folded: Vec<u32>,
@@ -73,6 +74,9 @@ struct Repair<'a> {
     state: State,
     corners: Corners,
     index: Index,
+    /// Crossing pairs when they were last looked for, and triangles that changed since.
+    pairs: Vec<(u32, u32)>,
+    changed: Vec<u32>,
     /// Farthest that a vertex may be from the zero level set.
     limit: f64,
     random: Random,
@@ -106,22 +110,23 @@ pub fn separate(
         lattice: &wrap.lattice,
         corners: Corners::new(at.positions.len(), &triangles),
         index: Index::new(&at.positions, &triangles),
+        pairs: Vec::new(),
+        changed: (0..triangles.len() as u32).collect(),
         state: State { at, diagonals: wrap.diagonals.clone(), triangles, along, targets },
         limit: OFF * diagonal,
         random: Random::new(),
     };
     repair.look_at(places)?;
     let mut found = repair.find()?;
-    let mut best = (found.faults(), repair.state.clone());
-    let mut best_found = found.triangles();
+    let mut best = (found.clone(), repair.state.clone());
     let mut budget = (wrap.positions.len() / SHARE).max(FEWEST);
     for cycle in 0..CYCLES {
-        if best.0.total() == 0 || budget == 0 {
+        let before = best.0.faults().total();
+        if before == 0 || budget == 0 {
             break;
         }
-        let before = best.0.total();
         if cycle > 0 {
-            let mut mask = repair.mask(&best_found);
+            let mut mask = repair.mask(&best.0.triangles());
             repair.loosen(&mut mask, cycle)?;
             found = repair.find()?;
         }
@@ -139,7 +144,6 @@ pub fn separate(
                     budget -= 1;
                 }
             }
-            repair.index = Index::new(&repair.state.at.positions, &repair.state.triangles);
             found = repair.find()?;
             if found.faults().total() == 0 {
                 break;
@@ -147,22 +151,21 @@ pub fn separate(
         }
         if found.faults().total() > 0 && cycle > 0 {
             // at every place the better of both
-            repair.mix(&best.1, &best_found, &found);
+            repair.mix(&best.1, &best.0, &found);
             found = repair.find()?;
         }
-        if found.faults().total() < best.0.total() {
-            best = (found.faults(), repair.state.clone());
-            best_found = found.triangles();
+        if found.faults().total() < before {
+            best = (found.clone(), repair.state.clone());
         } else {
-            repair.set(best.1.clone());
-        }
-        if cycle > 0 && best_found.len() > MANY && best.0.total() == before {
-            break;
+            repair.set(&best.1, &best.0);
+            if cycle > 0 && best.0.triangles().len() > MANY {
+                break;
+            }
         }
     }
-    let (faults, State { at, diagonals, .. }) = best;
+    let (found, State { at, diagonals, .. }) = best;
     (wrap.positions, wrap.values, wrap.gradients, wrap.diagonals) = (at.positions, at.values, at.gradients, diagonals);
-    Ok(faults)
+    Ok(found.faults())
 }
 
 /// A position as it will be written.
@@ -171,12 +174,27 @@ fn written(p: DVec3) -> DVec3 {
 }
 
 impl Repair<'_> {
-    /// Crossing pairs and folded triangles.
-    fn find(&self) -> Result<Found, Canceled> {
-        let state = &self.state;
-        let pairs = crossings(&self.index, &state.at.positions, &state.triangles, self.sampler.settings())?;
-        let folded = (0..state.along.len() as u32).filter(|&t| state.along[t as usize] <= FOLD).collect();
-        Ok(Found { pairs, folded })
+    /// Crossing pairs and folded triangles. Only what changed since the last time is looked at.
+    fn find(&mut self) -> Result<Found, Canceled> {
+        let mut changed = std::mem::take(&mut self.changed);
+        changed.sort_unstable();
+        changed.dedup();
+        let State { at, triangles, along, .. } = &self.state;
+        let fresh = crossings(&self.index, &at.positions, triangles, &changed, self.sampler.settings())?;
+        let old = |t: u32| changed.binary_search(&t).is_err();
+        self.pairs.retain(|&(i, j)| old(i) && old(j));
+        self.pairs.extend(fresh);
+        self.pairs.sort_unstable();
+        let folded = (0..along.len() as u32).filter(|&t| along[t as usize] <= FOLD).collect();
+        Ok(Found { pairs: self.pairs.clone(), folded })
+    }
+
+    /// Notes that triangles are now elsewhere.
+    fn note(&mut self, triangles: &[u32]) {
+        for &t in triangles {
+            self.index.update(t, self.corners_of(t));
+        }
+        self.changed.extend_from_slice(triangles);
     }
 
     /// Vertices of triangles.
@@ -188,10 +206,18 @@ impl Repair<'_> {
         mask
     }
 
-    fn set(&mut self, state: State) {
+    /// Goes back to a state and what was found in it.
+    fn set(&mut self, state: &State, found: &Found) {
+        let different = |&t: &u32| {
+            let (now, then) = (self.state.triangles[t as usize], state.triangles[t as usize]);
+            now != then || then.iter().any(|&v| self.state.at.positions[v as usize] != state.at.positions[v as usize])
+        };
+        let back: Vec<u32> = (0..state.triangles.len() as u32).filter(different).collect();
+        self.state.clone_from(state);
         self.corners = Corners::new(state.at.positions.len(), &state.triangles);
-        self.index = Index::new(&state.at.positions, &state.triangles);
-        self.state = state;
+        self.note(&back);
+        self.changed.clear();
+        self.pairs.clone_from(&found.pairs);
     }
 
     /// Shows the triangles at some places to the field.
@@ -226,7 +252,7 @@ impl Repair<'_> {
     }
 
     /// Takes every connected piece in which this state and `other` differ from the one in which less is wrong.
-    fn mix(&mut self, other: &State, other_wrong: &[u32], found: &Found) {
+    fn mix(&mut self, other: &State, other_found: &Found, found: &Found) {
         let n = self.state.at.positions.len();
         let mut parent: Vec<u32> = (0..n as u32).collect();
         fn root(parent: &mut [u32], mut v: u32) -> u32 {
@@ -250,18 +276,27 @@ impl Repair<'_> {
                 join(&[t[0], o[0]]);
             }
         }
-        for &(i, j) in &found.pairs {
-            let (s, t) = (self.state.triangles[i as usize], self.state.triangles[j as usize]);
-            join(&[s[0], s[1], s[2], t[0], t[1], t[2]]);
+        for (pairs, triangles) in [(&found.pairs, &self.state.triangles), (&other_found.pairs, &other.triangles)] {
+            for &(i, j) in pairs {
+                let (s, t) = (triangles[i as usize], triangles[j as usize]);
+                join(&[s[0], s[1], s[2], t[0], t[1], t[2]]);
+            }
         }
         let mut balance = vec![0i64; n];
         for t in found.triangles() {
             balance[root(&mut parent, self.state.triangles[t as usize][0]) as usize] += 1;
         }
-        for &t in other_wrong {
+        for t in other_found.triangles() {
             balance[root(&mut parent, other.triangles[t as usize][0]) as usize] -= 1;
         }
         let worse: Vec<bool> = (0..n as u32).map(|v| balance[root(&mut parent, v) as usize] > 0).collect();
+        let mut back = Vec::new();
+        for (t, &now) in self.state.triangles.iter().enumerate() {
+            let then = other.triangles[t];
+            if worse[now[0] as usize] && (now != then || now.iter().any(|&v| moved(v))) {
+                back.push(t as u32);
+            }
+        }
         let state = &mut self.state;
         for v in (0..n).filter(|&v| worse[v]) {
             state.at.positions[v] = other.at.positions[v];
@@ -279,7 +314,7 @@ impl Repair<'_> {
             }
         }
         self.corners = Corners::new(n, &self.state.triangles);
-        self.index = Index::new(&self.state.at.positions, &self.state.triangles);
+        self.note(&back);
     }
 
     fn corners_of(&self, t: u32) -> [DVec3; 3] {
@@ -315,8 +350,8 @@ impl Repair<'_> {
                     let t = pair[i] as usize;
                     (self.state.triangles[t], self.state.along[t], self.state.targets[t]) =
                         (then[i], along[i], targets[i]);
-                    self.index.update(pair[i], self.corners_of(pair[i]));
                 }
+                self.note(&pair);
             }
         }
         if changed {
@@ -370,7 +405,7 @@ impl Repair<'_> {
         stars.sort_unstable();
         stars.dedup();
         self.judge(&stars)?;
-        self.index = Index::new(&self.state.at.positions, &self.state.triangles);
+        self.note(&stars);
         Ok(())
     }
 
@@ -493,8 +528,8 @@ impl Repair<'_> {
         (self.state.at.values[v as usize], self.state.at.gradients[v as usize]) = (values[best], gradients[best]);
         for (j, &t) in star.iter().enumerate() {
             (self.state.along[t as usize], self.state.targets[t as usize]) = kept[j];
-            self.index.update(t, self.corners_of(t));
         }
+        self.note(&star);
         Ok(())
     }
 
@@ -618,7 +653,8 @@ mod tests {
 
     fn crossing(sampler: &Sampler<'_>, wrap: &Wrap) -> usize {
         let triangles = wrap.lattice.triangles(&wrap.diagonals);
-        crossings(&Index::new(&wrap.positions, &triangles), &wrap.positions, &triangles, sampler.settings())
+        let all: Vec<u32> = (0..triangles.len() as u32).collect();
+        crossings(&Index::new(&wrap.positions, &triangles), &wrap.positions, &triangles, &all, sampler.settings())
             .unwrap()
             .len()
     }
