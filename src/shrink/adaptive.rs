@@ -92,9 +92,9 @@ fn one(
         .ok_or(ShrinkError::Unmapped)?;
     stage("resample", 0.75, None, Some(map.energy), None);
     let directions = orient(&mesh, &map.directions, lattice.spec, &settings);
-    let landed = land(&mesh, &directions, lattice, &settings)?;
+    let (landed, normals) = land(&mesh, &directions, lattice, &settings)?;
     let edge = (mesh.area() / lattice.directions.len() as f64).sqrt();
-    let mut at = project(&sampler, landed.clone(), edge, 1e-3 * edge)?;
+    let mut at = project(&sampler, landed.clone(), &normals, edge, 1e-3 * edge)?;
     stage("untangle", 0.85, None, None, None);
     let diagonals = choose_diagonals(&sampler, lattice, &at)?;
     let triangles = lattice.triangles(&diagonals);

@@ -79,13 +79,17 @@ fn pole_rotation(mesh: &Mesh, directions: &[DVec3], settings: &Settings<'_>) -> 
     DMat3::from_cols(x, y, axis).transpose()
 }
 
-/// Where every lattice vertex lands on the base mesh, by linear interpolation in its triangle.
+/// Where every lattice vertex lands on the base mesh, by linear interpolation in its triangle, and the mesh's unit normals
+/// there.
 pub fn land(
     mesh: &Mesh,
     directions: &[DVec3],
     lattice: &SphereLattice,
     settings: &Settings<'_>,
-) -> Result<Vec<DVec3>, Canceled> {
+) -> Result<(Vec<DVec3>, Vec<DVec3>), Canceled> {
     let places = locate(mesh, directions, &lattice.directions, settings)?;
-    Ok(places.into_iter().map(|(t, w)| (0..3).map(|c| w[c] * mesh.positions[t[c] as usize]).sum()).collect())
+    let normals: Vec<DVec3> = (0..mesh.positions.len() as u32).map(|v| mesh.vertex_normal(v)).collect();
+    let mix =
+        |list: &[DVec3], (t, w): &([u32; 3], [f64; 3])| -> DVec3 { (0..3).map(|c| w[c] * list[t[c] as usize]).sum() };
+    Ok(places.iter().map(|place| (mix(&mesh.positions, place), mix(&normals, place).normalize_or_zero())).unzip())
 }
