@@ -75,7 +75,10 @@ pub fn study<'a>(sampler: &Sampler<'a>, spec: &ShrinkSpec, depth: u32) -> Result
     for (i, _) in thin_walls(&sampler.framed(frame), &grid)? {
         values[i] = values[i].min(-f32::MIN_POSITIVE);
     }
-    let solid: Vec<bool> = values.iter().map(|&v| v <= 0.0).collect();
+    // what could not be given up and is near is an unevenness below the lattice: it counts as solid, as in the contraction
+    let limit = (OBSTRUCTION * grid.h) as f32;
+    let inside = carve(&grid, &values, cancel)?;
+    let solid: Vec<bool> = (0..grid.len()).map(|i| inside[i] && values[i] <= limit).collect();
     let mut bodies = clusters(&grid, &solid);
     bodies.sort_by_key(|body| std::cmp::Reverse(body.len()));
     let empty: Vec<bool> = solid.iter().map(|s| !s).collect();
@@ -92,8 +95,13 @@ pub fn study<'a>(sampler: &Sampler<'a>, spec: &ShrinkSpec, depth: u32) -> Result
         let places = bodies.iter().take(PLACES).map(|body| middle(&grid, body, frame)).collect();
         return Err(ShrinkError::NoComponent { index: index as u32, count: bodies.len(), places });
     }
-    let territory = settle(&grid, &mut values, &bodies, chosen, &voids, cancel)?;
-    let kept: Vec<bool> = values.iter().map(|&v| v <= 0.0).collect();
+    let territory = settle(&grid, &mut values, (&bodies, chosen, &voids), &solid, cancel)?;
+    let kept: Vec<bool> = match &territory {
+        None => solid,
+        Some(labels) => {
+            (0..grid.len()).map(|i| (solid[i] && labels[i] == Label::Keep) || labels[i] == Label::Fill).collect()
+        }
+    };
     let pieces = if chosen.is_some() { 1 } else { bodies.len() as i64 };
     let mut topology = Topology {
         components: bodies.len() as u32,
@@ -127,9 +135,8 @@ pub fn study<'a>(sampler: &Sampler<'a>, spec: &ShrinkSpec, depth: u32) -> Result
 fn settle(
     grid: &Grid3,
     values: &mut [f32],
-    bodies: &[Vec<usize>],
-    chosen: Option<usize>,
-    voids: &[Vec<usize>],
+    (bodies, chosen, voids): (&[Vec<usize>], Option<usize>, &[Vec<usize>]),
+    solid: &[bool],
     cancel: &CancelToken,
 ) -> Result<Option<Vec<Label>>, Canceled> {
     let others = chosen.is_some() && bodies.len() > 1;
@@ -153,10 +160,10 @@ fn settle(
             voids.iter().flatten().for_each(|&i| is_void[i] = true);
             is_void
         };
-        let exterior: Vec<usize> = (0..grid.len()).filter(|&i| values[i] > 0.0 && !is_void[i]).collect();
+        let exterior: Vec<usize> = (0..grid.len()).filter(|&i| !solid[i] && !is_void[i]).collect();
         let mut seeds: Vec<(&[usize], u32)> = vec![(exterior.as_slice(), 0)];
         seeds.extend(voids.iter().map(|void| (void.as_slice(), 1)));
-        let side = flood(grid, &seeds, |i| values[i] <= 0.0, cancel)?;
+        let side = flood(grid, &seeds, |i| solid[i], cancel)?;
         for (label, side) in labels.iter_mut().zip(side) {
             if side == 1 && *label == Label::Keep {
                 *label = Label::Fill;

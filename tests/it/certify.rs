@@ -3,6 +3,7 @@
 use crate::app::{App, BINARY, problem, small, state};
 use crate::walk::follow;
 use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// A fork, whose tines the eighteen vertices of the coarsest octahedral lattice cannot follow.
@@ -153,5 +154,41 @@ fn extract_writes_what_did_not_pass_and_says_what_and_where() {
     assert_eq!(extras(&std::fs::read(&glb).expect("reads"))["report"]["verdict"]["passed"], false);
     for wrong in [["--attempts", "4"], ["--density", "even"], ["--component", "-1"], ["--max-evaluations", "0"]] {
         assert_eq!(run(&wrong).status.code(), Some(2), "{wrong:?}");
+    }
+}
+
+/// The shared meshes of higher genus, with their genus; none where the data is not there.
+fn shapes_with_handles() -> Vec<(PathBuf, u64)> {
+    let data = std::env::var_os("SHRINKD_DATA").map(PathBuf::from);
+    let data = data.unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"));
+    let shapes = [("torus", 1), ("rocker_arm", 1), ("three_holes", 3), ("fertility", 4)];
+    let shapes = shapes.map(|(name, genus)| (data.join(format!("meshes/genus/{name}.ply")), genus));
+    shapes.into_iter().filter(|(path, _)| path.exists()).collect()
+}
+
+#[test]
+fn meshes_with_handles_are_refused_with_their_genus_and_wrapped_when_asked() {
+    let shapes = shapes_with_handles();
+    if shapes.is_empty() {
+        println!("skipped: no shared meshes");
+    }
+    let folder = tempfile::tempdir().expect("folder");
+    let (glb, report) = (folder.path().join("out.glb"), folder.path().join("report.json"));
+    for (mesh, genus) in shapes {
+        let run = |further: &[&str]| {
+            let mut command = Command::new(BINARY);
+            command.arg("extract").arg(&mesh).arg("-o").arg(&glb).args(["--lattice", "octahedral:40"]).args(further);
+            let output = command.output().expect("runs");
+            (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+        };
+        let (code, said) = run(&[]);
+        assert_eq!(code, Some(4), "{} {said}", mesh.display());
+        assert!(said.contains(&format!("genus {genus},")), "{said}");
+        let (code, said) = run(&["--on-topology", "wrap", "--report", report.to_str().expect("text")]);
+        assert_eq!(code, Some(0), "{} {said}", mesh.display());
+        let report: Value = serde_json::from_slice(&std::fs::read(&report).expect("reads")).expect("JSON");
+        assert_eq!(report["topology"]["handles"], genus, "{}", mesh.display());
+        let area = report["topology"]["invented_area"].as_f64().expect("a share");
+        assert!(area > 0.0 && area < 0.3, "{} invents {area}", mesh.display());
     }
 }
