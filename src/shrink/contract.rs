@@ -28,7 +28,7 @@ const PROBE: f64 = 1.5;
 const SOLID: f64 = 0.45;
 /// Nodes that could not be given up and are farther outside than this many spacings are the membrane of a handle, the
 /// bridge to another component, or a void.
-const OBSTRUCTION: f64 = 1.8;
+pub(super) const OBSTRUCTION: f64 = 1.8;
 /// An obstruction that reaches farther outside than this many spacings is no matter of resolution.
 const CERTAIN: f64 = 6.0;
 
@@ -66,13 +66,18 @@ pub struct Resolution {
     pub probe: bool,
 }
 
-/// Contracts a sphere around the domain onto the zero level set.
-///
-/// # Errors
-/// A [`Refusal`] with [`ShrinkError::Empty`], [`ShrinkError::Components`], [`ShrinkError::Genus`] or
-/// [`ShrinkError::Canceled`].
-pub fn contract(scene: &Sampler<'_>, resolution: Resolution) -> Result<Front, Refusal> {
-    let settings = *scene.settings();
+/// What the contraction works on.
+pub(super) struct Lattice {
+    /// The lattice, in frame units, with values that change by about 1 per length.
+    pub grid: Grid3,
+    /// The frame that the lattice is in: about unit size, centred on the shape.
+    pub frame: Frame,
+    /// Change of the field's own value per length, by which values were divided.
+    pub slope: f64,
+}
+
+/// Evaluates the field on a lattice over the shape, near the zero level set.
+pub(super) fn lattice(scene: &Sampler<'_>, resolution: Resolution) -> Result<Lattice, Refusal> {
     let domain = scene.domain();
     let (mut lo, mut hi) = (DVec3::from(domain.min), DVec3::from(domain.max));
     let mut size = (hi - lo).max_element();
@@ -114,16 +119,19 @@ pub fn contract(scene: &Sampler<'_>, resolution: Resolution) -> Result<Front, Re
     for v in &mut grid.values {
         *v = (f64::from(*v) / (slope * frame.scale)) as f32;
     }
+    Ok(Lattice { grid, frame, slope })
+}
+
+/// Contracts a sphere around the domain onto the zero level set.
+///
+/// # Errors
+/// A [`Refusal`] with [`ShrinkError::Empty`], [`ShrinkError::Components`], [`ShrinkError::Genus`] or
+/// [`ShrinkError::Canceled`].
+pub fn contract(scene: &Sampler<'_>, resolution: Resolution) -> Result<Front, Refusal> {
+    let settings = *scene.settings();
+    let Lattice { grid, frame, .. } = lattice(scene, resolution)?;
     let sampler = scene.framed(frame);
-    let walls = if resolution.probe { thin(&sampler, &grid, Thin::Wall)? } else { Vec::new() };
-    let gaps = thin(&sampler, &grid, Thin::Gap)?;
-    let mut target = grid.values.clone();
-    for &(i, _) in &walls {
-        target[i] = -f32::MIN_POSITIVE;
-    }
-    for &(i, _) in &gaps {
-        target[i] = f32::MIN_POSITIVE;
-    }
+    let Marked { target, walls, gaps } = mark(&sampler, &grid, resolution.probe)?;
     let inside = carve(&grid, &target, settings.cancel)?;
 
     let limit = (OBSTRUCTION * grid.h) as f32;
@@ -149,6 +157,30 @@ fn slope_of(sampler: &Sampler<'_>, grid: &Grid3) -> f64 {
 fn reach(grid: &Grid3, slope: f64, last: bool) -> f64 {
     let diagonal = 3f64.sqrt() * 0.5 * grid.h;
     slope * diagonal * if last { REACH.1 } else { REACH.0 }
+}
+
+/// What the contraction takes the nodes for.
+pub(super) struct Marked {
+    /// The values, with the signs that the nodes count with.
+    pub target: Vec<f32>,
+    /// Nodes that count as inside though the field is positive, beside thin walls, and where they stand.
+    walls: Vec<(usize, DVec3)>,
+    /// Nodes that count as outside though the field is not, beside narrow gaps, and where they stand.
+    gaps: Vec<(usize, DVec3)>,
+}
+
+/// Finds thin walls, if `probe` asks for it, and narrow gaps.
+pub(super) fn mark(sampler: &Sampler<'_>, grid: &Grid3, probe: bool) -> Result<Marked, Canceled> {
+    let walls = if probe { thin(sampler, grid, Thin::Wall)? } else { Vec::new() };
+    let gaps = thin(sampler, grid, Thin::Gap)?;
+    let mut target = grid.values.clone();
+    for &(i, _) in &walls {
+        target[i] = -f32::MIN_POSITIVE;
+    }
+    for &(i, _) in &gaps {
+        target[i] = f32::MIN_POSITIVE;
+    }
+    Ok(Marked { target, walls, gaps })
 }
 
 /// Which side of the surface is looked at for being thinner than the lattice can hold.
@@ -272,7 +304,7 @@ fn simple_table() -> &'static [bool] {
 
 /// Gives up simple nodes with a positive value, farthest outside first, starting from the outermost layer. Returns which
 /// nodes stay inside.
-fn carve(grid: &Grid3, values: &[f32], cancel: &CancelToken) -> Result<Vec<bool>, Canceled> {
+pub(super) fn carve(grid: &Grid3, values: &[f32], cancel: &CancelToken) -> Result<Vec<bool>, Canceled> {
     /// Buckets that positive values are sorted into; within a bucket the order is that of arrival.
     const BUCKETS: usize = 4096;
     let simple = simple_table();
