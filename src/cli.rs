@@ -3,9 +3,11 @@
 //! Exit codes: 0 done; 1 failed, or made a result that did not pass its own checks; 2 bad usage; 3 bad input; 4 the shape
 //! could not be wrapped.
 
+pub mod compare;
 pub mod extract;
 pub mod first_job;
 pub mod healthcheck;
+mod interrupt;
 pub mod serve;
 
 use crate::field::Domain;
@@ -40,6 +42,9 @@ enum Command {
     Serve(ServeArgs),
     /// Wrap one field: exits 0 when the result is closed, has Euler characteristic 2 and no flips
     Extract(ExtractArgs),
+    /// Wrap every field of a folder and write a table of how good the results are
+    #[command(after_long_help = COMPARE_EXAMPLES)]
+    Compare(CompareArgs),
     /// Print the description of the service (OpenAPI 3.1, YAML)
     Openapi,
     /// Ask a service whether it is ready: exits 0 when it is
@@ -106,6 +111,54 @@ pub struct ExtractArgs {
     pub threads: usize,
 }
 
+/// What `compare --help` ends with.
+const COMPARE_EXAMPLES: &str = "\
+Examples:
+  shrinkd compare examples/scenes
+  shrinkd compare meshes --out results --expect-refusal 'genus/*'
+  shrinkd compare meshes --only spot --only bunny --lattice octahedral:144 --no-baseline
+
+Exits 0 when every shape succeeded or was refused as expected, 1 when one did not or the run was interrupted, 2 on bad
+usage, 3 when the folder cannot be read or holds no field.";
+
+/// Arguments of `compare`.
+#[derive(Debug, Args)]
+pub struct CompareArgs {
+    /// The folder; scenes, networks, meshes and grids in it and in the folders below are told by their content
+    pub dir: PathBuf,
+    /// Where the sphere is sampled: latlong:N_THETAxN_PHI or octahedral:N; several times for several
+    /// [default: latlong:200x100 and octahedral:72]
+    #[arg(long, value_parser = parse_lattice)]
+    pub lattice: Vec<LatticeSpec>,
+    /// How the sphere is contracted
+    #[arg(long, value_enum, default_value_t = MethodArg::Adaptive)]
+    pub method: MethodArg,
+    /// Folder for compare.md and compare.json, written as results come
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Where the JSON goes [default: compare.json in the folder of --out]
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+    /// Take only shapes whose path in the folder holds this text, or fits this pattern with `*`; may be repeated
+    #[arg(long, value_name = "PATTERN")]
+    pub only: Vec<String>,
+    /// Shapes that a sphere cannot wrap and that must be refused, told as for --only; may be repeated
+    #[arg(long, value_name = "PATTERN")]
+    pub expect_refusal: Vec<String>,
+    /// Leave out marching cubes of as many vertices
+    #[arg(long)]
+    pub no_baseline: bool,
+    /// Seconds that a shape may take on one lattice; over that it counts as failed
+    #[arg(long, value_name = "SECONDS")]
+    pub limit: Option<u64>,
+    /// Keep the surfaces too, in the folder `glb` of --out
+    #[arg(long, requires = "out")]
+    pub glb: bool,
+    /// Threads; 0 is one per core. The results do not depend on it
+    #[arg(long, default_value_t = 0)]
+    pub threads: usize,
+}
+
 /// How the sphere is contracted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum MethodArg {
@@ -158,6 +211,7 @@ pub fn run() -> ExitCode {
     match Cli::parse().command {
         Command::Serve(args) => serve::run(&args),
         Command::Extract(args) => extract::run(&args),
+        Command::Compare(args) => compare::run(&args),
         Command::Openapi => openapi(),
         Command::Healthcheck { url } => healthcheck::run(&url),
     }

@@ -4,6 +4,7 @@
 //! Every definition is in `docs/metrics.md`. Nothing here depends on the number of threads: work is cut into fixed chunks
 //! whose results are gathered in order.
 
+pub mod baseline;
 pub mod bvh;
 pub mod certificate;
 pub mod chamfer;
@@ -15,6 +16,7 @@ pub mod nearest;
 pub mod predicates;
 pub mod report;
 pub mod sampling;
+pub mod truth;
 pub mod zero_set;
 
 pub use report::Report;

@@ -5,7 +5,9 @@ use super::certificate::positions;
 use super::nearest::Nearest;
 use super::report::{Distance, OneWay};
 use super::sampling::{Samples, by_area};
-use super::{corners, diagonal, doubled_normal, zero_set};
+use super::truth::Truth;
+use super::zero_set::{self, ZeroSet};
+use super::{corners, diagonal, doubled_normal};
 use crate::field::mesh::TriangleMesh;
 use crate::field::{Metric, Sampler};
 use crate::settings::{Canceled, Settings};
@@ -40,6 +42,8 @@ pub struct Comparison {
     pub normal_consistency: f64,
     /// The same with the sign: n . n'.
     pub normal_consistency_signed: f64,
+    /// Where the largest distances were met, scene units: on the surface, on the truth.
+    pub worst_places: [DVec3; 2],
 }
 
 /// Distances and cosines of normals from samples of one side, weighted.
@@ -49,18 +53,24 @@ struct Tallied {
     sum: f64,
     squares: f64,
     max: f64,
+    worst: DVec3,
     cosine: f64,
     cosine_absolute: f64,
 }
 
 impl Tallied {
-    fn add(&mut self, weight: f64, distance: f64, cosine: f64) {
+    fn add(&mut self, weight: f64, distance: f64, cosine: f64, place: DVec3) {
         self.weight += weight;
         self.sum += weight * distance;
         self.squares += weight * distance * distance;
-        self.max = self.max.max(distance);
+        self.reach(distance, place);
         self.cosine += weight * cosine;
         self.cosine_absolute += weight * cosine.abs();
+    }
+    fn reach(&mut self, distance: f64, place: DVec3) {
+        if distance > self.max {
+            (self.max, self.worst) = (distance, place);
+        }
     }
     fn one_way(&self, diagonal: f64) -> OneWay {
         let n = self.weight.max(f64::MIN_POSITIVE);
@@ -74,18 +84,19 @@ impl Tallied {
     }
 }
 
-fn both(surface_to_truth: OneWay, truth_to_surface: OneWay) -> Comparison {
-    let (a, b) = (surface_to_truth, truth_to_surface);
+fn both(there: &Tallied, back: &Tallied, diagonal: f64) -> Comparison {
+    let (a, b) = (there.one_way(diagonal), back.one_way(diagonal));
     Comparison {
         distance: Distance {
             mean: 0.5 * (a.mean + b.mean),
             rms: (0.5 * (a.rms * a.rms + b.rms * b.rms)).sqrt(),
             max: a.max.max(b.max),
-            surface_to_truth,
-            truth_to_surface,
+            surface_to_truth: a,
+            truth_to_surface: b,
         },
         normal_consistency: 0.5 * (a.normal_consistency + b.normal_consistency),
         normal_consistency_signed: 0.5 * (a.normal_consistency_signed + b.normal_consistency_signed),
+        worst_places: [there.worst, back.worst],
     }
 }
 
@@ -110,20 +121,21 @@ pub fn between(
         return Ok(None);
     }
     let size = diagonal(truth.vertices);
-    let there = one_way(surface, &on_surface, truth, settings)?.one_way(size);
-    let back = one_way(truth, &on_truth, surface, settings)?.one_way(size);
-    Ok(Some(both(there, back)))
+    let there = one_way(surface, &on_surface, truth, settings)?;
+    let back = one_way(truth, &on_truth, surface, settings)?;
+    Ok(Some(both(&there, &back, size)))
 }
 
 fn one_way(from: Mesh<'_>, samples: &Samples, to: Mesh<'_>, settings: &Settings<'_>) -> Result<Tallied, Canceled> {
     let nearest = Nearest::new(to.vertices, to.triangles);
     let (from_normals, to_normals) = (unit_normals(from), unit_normals(to));
     let mut tallied = Tallied::default();
-    for (hit, &t) in nearest.closest_all(&samples.points, settings)?.iter().zip(&samples.triangles) {
-        tallied.add(1.0, hit.distance(), from_normals[t as usize].dot(to_normals[hit.triangle as usize]));
+    let hits = nearest.closest_all(&samples.points, settings)?;
+    for ((hit, &t), &p) in hits.iter().zip(&samples.triangles).zip(&samples.points) {
+        tallied.add(1.0, hit.distance(), from_normals[t as usize].dot(to_normals[hit.triangle as usize]), p);
     }
-    for hit in nearest.closest_all(from.vertices, settings)? {
-        tallied.max = tallied.max.max(hit.distance());
+    for (hit, &p) in nearest.closest_all(from.vertices, settings)?.iter().zip(from.vertices) {
+        tallied.reach(hit.distance(), p);
     }
     Ok(tallied)
 }
@@ -139,9 +151,21 @@ fn one_way(from: Mesh<'_>, samples: &Samples, to: Mesh<'_>, settings: &Settings<
 /// # Errors
 /// When the token is raised.
 pub fn to_field(surface: Mesh<'_>, samples: usize, sampler: &Sampler<'_>) -> Result<Option<Comparison>, Canceled> {
+    to_zero_set(surface, samples, &zero_set::find(sampler)?, sampler)
+}
+
+/// As [`to_field`], with the points on its zero level set found already.
+///
+/// # Errors
+/// When the token is raised.
+pub fn to_zero_set(
+    surface: Mesh<'_>,
+    samples: usize,
+    zeros: &ZeroSet,
+    sampler: &Sampler<'_>,
+) -> Result<Option<Comparison>, Canceled> {
     let settings = sampler.settings();
     let on_surface = by_area(surface.vertices, surface.triangles, samples, SEEDS[0]);
-    let zeros = zero_set::find(sampler)?;
     if on_surface.points.is_empty() || zeros.points.is_empty() {
         return Ok(None);
     }
@@ -150,29 +174,25 @@ pub fn to_field(surface: Mesh<'_>, samples: usize, sampler: &Sampler<'_>) -> Res
 
     let mut starts = on_surface.points.clone();
     starts.extend_from_slice(surface.vertices);
-    let landed = land(&starts, &zeros, REACH * size, sampler)?;
+    let landed = land(&starts, zeros, REACH * size, sampler)?;
     let mut there = Tallied::default();
     for (i, (distance, normal)) in landed.iter().enumerate() {
         match on_surface.triangles.get(i) {
-            Some(&t) => there.add(1.0, *distance, normals[t as usize].dot(*normal)),
-            None => there.max = there.max.max(*distance),
+            Some(&t) => there.add(1.0, *distance, normals[t as usize].dot(*normal), starts[i]),
+            None => there.reach(*distance, starts[i]),
         }
     }
     let nearest = Nearest::new(surface.vertices, surface.triangles);
     let mut back = Tallied::default();
     for (i, hit) in nearest.closest_all(&zeros.points, settings)?.iter().enumerate() {
-        back.add(zeros.weights[i], hit.distance(), normals[hit.triangle as usize].dot(zeros.normals[i]));
+        let cosine = normals[hit.triangle as usize].dot(zeros.normals[i]);
+        back.add(zeros.weights[i], hit.distance(), cosine, zeros.points[i]);
     }
-    Ok(Some(both(there.one_way(size), back.one_way(size))))
+    Ok(Some(both(&there, &back, size)))
 }
 
 /// Distance from every start to the zero set, and the unit gradient where it lands.
-fn land(
-    starts: &[DVec3],
-    zeros: &zero_set::ZeroSet,
-    reach: f64,
-    sampler: &Sampler<'_>,
-) -> Result<Vec<(f64, DVec3)>, Canceled> {
+fn land(starts: &[DVec3], zeros: &ZeroSet, reach: f64, sampler: &Sampler<'_>) -> Result<Vec<(f64, DVec3)>, Canceled> {
     if sampler.field().metric() == Metric::Exact {
         // the gradient is the same all along the way to the closest point
         let (values, gradients) = sampler.gradients(starts)?;
@@ -201,15 +221,7 @@ pub fn mesh_vertices(mesh: &TriangleMesh) -> Vec<DVec3> {
 /// When the token is raised.
 pub fn to_truth(surface: &Surface, sampler: &Sampler<'_>) -> Result<Option<Comparison>, Canceled> {
     let vertices = positions(surface);
-    let mesh = Mesh { vertices: &vertices, triangles: &surface.triangles };
-    match sampler.field().truth() {
-        Some(truth) => {
-            let truth_vertices = mesh_vertices(truth);
-            let truth = Mesh { vertices: &truth_vertices, triangles: &truth.triangles };
-            between(mesh, truth, SAMPLES, sampler.settings())
-        }
-        None => to_field(mesh, FIELD_SAMPLES, sampler),
-    }
+    Truth::of(sampler)?.compare(Mesh { vertices: &vertices, triangles: &surface.triangles })
 }
 
 #[cfg(test)]
@@ -265,10 +277,12 @@ mod tests {
         let n = vertices.len() as u32;
         let both: Vec<[u32; 3]> = triangles.iter().copied().chain(triangles.iter().map(|t| t.map(|v| v + n))).collect();
         let (a, b) = (Mesh { vertices: &vertices, triangles: &triangles }, Mesh { vertices: &all, triangles: &both });
-        let c = with_settings(1, |s| between(a, b, 1000, s).unwrap().unwrap()).distance;
+        let Comparison { distance: c, worst_places: worst, .. } =
+            with_settings(1, |s| between(a, b, 1000, s).unwrap().unwrap());
         assert!(c.surface_to_truth.max < 1e-15);
         let size = DVec3::new(3.1, 2.0, 2.0).length();
         assert!((c.truth_to_surface.max * size - 1.1).abs() < 1e-3, "{c:?}");
+        assert!(worst[1].distance(2.1 * DVec3::X) < 0.05, "{worst:?}");
     }
 
     fn against_field(field: &dyn Field, radius: f64) -> Comparison {
