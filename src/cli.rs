@@ -4,6 +4,7 @@
 //! could not be wrapped.
 
 pub mod compare;
+pub mod evaluate;
 pub mod extract;
 pub mod first_job;
 pub mod healthcheck;
@@ -12,6 +13,7 @@ pub mod serve;
 
 use crate::field::Domain;
 use crate::field::input::{DomainName, DomainOption};
+use crate::measure::chart::SphereChart;
 use crate::shrink::Method;
 use crate::shrink::lattice::LatticeSpec;
 use clap::{Args, Parser, Subcommand, ValueEnum};
@@ -42,6 +44,9 @@ enum Command {
     Serve(ServeArgs),
     /// Wrap one field: exits 0 when the result is closed, has Euler characteristic 2 and no flips
     Extract(ExtractArgs),
+    /// Measure a GLB or any mesh against a mesh or a field, beside marching cubes on the same field
+    #[command(after_long_help = EVALUATE_EXAMPLES)]
+    Evaluate(EvaluateArgs),
     /// Wrap every field of a folder and write a table of how good the results are
     #[command(after_long_help = COMPARE_EXAMPLES)]
     Compare(CompareArgs),
@@ -111,6 +116,69 @@ pub struct ExtractArgs {
     pub threads: usize,
 }
 
+/// What `evaluate --help` ends with.
+const EVALUATE_EXAMPLES: &str = "\
+Examples:
+  shrinkd extract spot.ply -o spot.glb && shrinkd evaluate spot.glb --truth spot.ply
+  shrinkd evaluate other_program.obj --truth spot.ply --json > spot.json
+  shrinkd evaluate fork.glb --truth examples/scenes/fork.json --no-baseline --check
+
+Exits 0 when it was measured, 1 when --check was asked for and a condition of success does not hold, 2 on bad usage, 3
+when a file cannot be read as a mesh or a field.";
+
+/// Arguments of `evaluate`.
+#[derive(Debug, Args)]
+pub struct EvaluateArgs {
+    /// What is measured: a mesh (GLB, PLY, OBJ, STL, OFF), whoever made it
+    pub mesh: PathBuf,
+    /// What it is measured against: a mesh, a scene, a network or a sampled grid
+    #[arg(long, value_name = "MESH|FIELD")]
+    pub truth: PathBuf,
+    /// Print JSON in place of the table
+    #[arg(long)]
+    pub json: bool,
+    /// Exit 1 when it is not closed, of Euler number 2, one chart, without flips and self-intersections, and within 1 % of
+    /// the diagonal
+    #[arg(long)]
+    pub check: bool,
+    /// What the texture coordinates are, where the file does not say so itself
+    #[arg(long, value_enum)]
+    pub chart: Option<ChartArg>,
+    /// Leave out marching cubes
+    #[arg(long)]
+    pub no_baseline: bool,
+    /// Latent code of an auto-decoder that is the truth: a JSON list of numbers
+    #[arg(long, value_name = "FILE.json", conflicts_with = "latent_row")]
+    pub latent: Option<PathBuf>,
+    /// Row of the truth's own table of latent codes
+    #[arg(long, value_name = "N")]
+    pub latent_row: Option<u32>,
+    /// Box that holds the truth's zero level set (of a grid: that its samples span): fit, or X0,Y0,Z0,X1,Y1,Z1
+    #[arg(long, value_name = "BOX", value_parser = parse_domain, allow_hyphen_values = true)]
+    pub domain: Option<DomainOption>,
+    /// Threads; 0 is one per core. The result does not depend on it
+    #[arg(long, default_value_t = 0)]
+    pub threads: usize,
+}
+
+/// Charts in which every place is a direction on the sphere.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum ChartArg {
+    /// u is the longitude, v the latitude from the north pole
+    Latlong,
+    /// The unfolded octahedron of equal areas
+    Octahedral,
+}
+
+impl From<ChartArg> for SphereChart {
+    fn from(chart: ChartArg) -> Self {
+        match chart {
+            ChartArg::Latlong => SphereChart::Latlong,
+            ChartArg::Octahedral => SphereChart::Octahedral,
+        }
+    }
+}
+
 /// What `compare --help` ends with.
 const COMPARE_EXAMPLES: &str = "\
 Examples:
@@ -133,7 +201,7 @@ pub struct CompareArgs {
     /// How the sphere is contracted
     #[arg(long, value_enum, default_value_t = MethodArg::Adaptive)]
     pub method: MethodArg,
-    /// Folder for compare.md and compare.json, written as results come
+    /// Folder for compare.md and compare.json, written as results come, and a contact sheet of pictures for every lattice
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Where the JSON goes [default: compare.json in the folder of --out]
@@ -211,6 +279,7 @@ pub fn run() -> ExitCode {
     match Cli::parse().command {
         Command::Serve(args) => serve::run(&args),
         Command::Extract(args) => extract::run(&args),
+        Command::Evaluate(args) => evaluate::run(&args),
         Command::Compare(args) => compare::run(&args),
         Command::Openapi => openapi(),
         Command::Healthcheck { url } => healthcheck::run(&url),

@@ -1,5 +1,5 @@
 //! `shrinkd compare`: wraps every field of a folder on every lattice that is asked for, measures each result beside marching
-//! cubes of as many vertices on the same field, and writes a table, JSON and a contact sheet as the results come.
+//! cubes of as many vertices on the same field, and writes a table and JSON as the results come, and contact sheets.
 //!
 //! A shape that fails, or that makes the program panic, is a row like any other. A shape that is refused for its topology is
 //! counted by itself. Ctrl-C ends the shape at hand; what was done by then is written.
@@ -8,11 +8,13 @@ mod clocked;
 mod one;
 mod row;
 mod shapes;
+mod sheet;
 mod summary;
 
 use super::{BAD_INPUT, CompareArgs, FAILED, fail, interrupt};
 use crate::settings::CancelToken;
 use crate::shrink::lattice::LatticeSpec;
+use crate::surface::sheet::{Tile, to_png};
 use row::Row;
 use serde_json::{Value, json};
 use shapes::{Shape, find};
@@ -53,13 +55,14 @@ fn compare(args: &CompareArgs) -> Result<bool, (u8, String)> {
 
     let mut log = Log::new(args, &lattices)?;
     let mut unread = Vec::new();
-    let spec = one::Task {
+    let task = one::Task {
         method: args.method.into(),
         lattices: &lattices,
         baseline: !args.no_baseline,
         limit: args.limit.map(Duration::from_secs),
         expected: &args.expect_refusal,
         keep: args.out.as_deref().filter(|_| args.glb),
+        draw: args.out.is_some(),
         pool: &pool,
         stop: &stop,
     };
@@ -67,7 +70,7 @@ fn compare(args: &CompareArgs) -> Result<bool, (u8, String)> {
         if stop.is_canceled() {
             break;
         }
-        match one::run(shape, &spec, &mut |row| log.add(row)) {
+        match one::run(shape, &task, &mut |row, picture| log.add(row, picture)) {
             Ok(()) => {}
             Err(one::Ended::Unread(why)) => unread.push((shape.name.clone(), why)),
             Err(one::Ended::Stopped) => break,
@@ -83,6 +86,9 @@ fn compare(args: &CompareArgs) -> Result<bool, (u8, String)> {
 /// Where rows go as they come.
 struct Log<'a> {
     rows: Vec<Row>,
+    /// Pictures of the rows, in the same order.
+    pictures: Vec<Vec<u8>>,
+    out: Option<&'a Path>,
     table: Option<(PathBuf, std::fs::File)>,
     json: Option<PathBuf>,
     lattices: &'a [LatticeSpec],
@@ -100,7 +106,15 @@ impl<'a> Log<'a> {
             }
         };
         let json = args.json.clone().or_else(|| args.out.as_ref().map(|out| out.join("compare.json")));
-        let mut log = Self { rows: Vec::new(), table, json, lattices, dir: &args.dir };
+        let mut log = Self {
+            rows: Vec::new(),
+            pictures: Vec::new(),
+            out: args.out.as_deref(),
+            table,
+            json,
+            lattices,
+            dir: &args.dir,
+        };
         log.say(&row::head())?;
         Ok(log)
     }
@@ -116,9 +130,10 @@ impl<'a> Log<'a> {
         Ok(())
     }
 
-    fn add(&mut self, row: Row) -> Result<(), String> {
+    fn add(&mut self, row: Row, picture: Vec<u8>) -> Result<(), String> {
         self.say(&row.to_markdown()).map_err(|e| e.1)?;
         self.rows.push(row);
+        self.pictures.push(picture);
         self.write_json(&[], true).map_err(|e| e.1)
     }
 
@@ -135,7 +150,22 @@ impl<'a> Log<'a> {
             text.push_str(&format!("\nInterrupted after {done} of {all} results.\n"));
         }
         self.say(&text)?;
-        self.write_json(unread, interrupted)
+        self.write_json(unread, interrupted)?;
+        self.write_sheets()
+    }
+
+    /// A contact sheet for every lattice.
+    fn write_sheets(&mut self) -> Result<(), (u8, String)> {
+        let Some(out) = self.out else { return Ok(()) };
+        for &lattice in self.lattices {
+            let rows = self.rows.iter().zip(&mut self.pictures).filter(|(row, _)| row.lattice == lattice);
+            let tiles: Vec<Tile> = rows.map(|(row, picture)| sheet::tile(row, std::mem::take(picture))).collect();
+            if !tiles.is_empty() {
+                let path = out.join(format!("contact-{}.png", row::lattice_name(lattice).replace(':', "-")));
+                std::fs::write(&path, to_png(&tiles)).map_err(|e| told(&path, &e))?;
+            }
+        }
+        Ok(())
     }
 
     /// Writes the whole document anew, beside and then over the old one, so that a reader never sees half of it.

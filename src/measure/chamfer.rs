@@ -18,7 +18,7 @@ pub const F1_AT: [f64; 2] = [0.001, 0.003];
 pub const EF1_AT: f64 = 0.005;
 
 /// Sample-to-sample measures, in the units of the meshes (NDC: the longest side is 0.9).
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize)]
 pub struct Chamfer {
     /// mean d(G -> P) + mean d(P -> G).
     pub cd1: f64,

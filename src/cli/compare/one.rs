@@ -4,6 +4,7 @@ use super::clocked::{Clocked, Watch};
 use super::fits;
 use super::row::{Outcome, Row, lattice_name};
 use super::shapes::Shape;
+use super::sheet;
 use crate::field::input::{Description, FieldOptions};
 use crate::field::sampler::Tally;
 use crate::field::{Field, Sampler};
@@ -42,6 +43,8 @@ pub struct Task<'a> {
     pub expected: &'a [String],
     /// Folder that the GLBs go to.
     pub keep: Option<&'a Path>,
+    /// Whether pictures are drawn.
+    pub draw: bool,
     /// The pool.
     pub pool: &'a rayon::ThreadPool,
     /// Raised by the signal.
@@ -58,16 +61,19 @@ pub enum Ended {
     Io(String),
 }
 
+/// Takes a row as it comes, with its picture (empty for none).
+pub type Add<'a> = &'a mut dyn FnMut(Row, Vec<u8>) -> Result<(), String>;
+
 /// Wraps a shape on every lattice and hands over each row as it comes.
-pub fn run(shape: &Shape, task: &Task<'_>, add: &mut dyn FnMut(Row) -> Result<(), String>) -> Result<(), Ended> {
+pub fn run(shape: &Shape, task: &Task<'_>, add: Add<'_>) -> Result<(), Ended> {
     let clock = Instant::now();
     let watch = Arc::new(Watch::default());
     let opened = open(shape, &watch).map_err(Ended::Unread)?;
     let load = clock.elapsed().as_secs_f64();
     let mut beside = Beside::default();
     for &lattice in task.lattices {
-        let row = wrapped(shape, task, &opened, &watch, lattice, load, &mut beside)?;
-        add(row).map_err(Ended::Io)?;
+        let (row, picture) = wrapped(shape, task, &opened, &watch, lattice, load, &mut beside)?;
+        add(row, picture).map_err(Ended::Io)?;
     }
     Ok(())
 }
@@ -115,10 +121,10 @@ fn wrapped(
     lattice: LatticeSpec,
     load: f64,
     beside: &mut Beside,
-) -> Result<Row, Ended> {
+) -> Result<(Row, Vec<u8>), Ended> {
     let clock = Instant::now();
     let spec = ShrinkSpec { method: task.method, lattice, ..ShrinkSpec::default() };
-    let outputs: &[OutputName] = if task.keep.is_some() { &[OutputName::Glb] } else { &[] };
+    let outputs: &[OutputName] = if task.draw || task.keep.is_some() { &[OutputName::Glb] } else { &[] };
     // what is measured after shrinking is not part of its time in the field
     let progress = |progress: Progress| watch.pause(matches!(progress.stage, "measure" | "write"));
     watch.reset();
@@ -140,6 +146,7 @@ fn wrapped(
         report: None,
         baseline: None,
     };
+    let mut picture = Vec::new();
     let expected = task.expected.iter().any(|pattern| fits(pattern, &shape.name));
     match made {
         Guarded::Done(Ok(made)) => {
@@ -148,11 +155,15 @@ fn wrapped(
             if let Some(folder) = task.keep {
                 keep(folder, shape, lattice, &made).map_err(Ended::Io)?;
             }
-            let vertices = made.report.vertices;
-            row.report = Some(made.report);
-            if task.baseline {
-                row.baseline = with_baseline(task, opened, vertices, beside)?;
+            let settings = Settings { pool: task.pool, cancel: task.stop, progress: &|_| {} };
+            if task.draw {
+                picture = sheet::picture(&made, lattice, &settings).map_err(|Canceled| Ended::Stopped)?;
             }
+            if task.baseline {
+                let found = beside.get(opened.field.as_ref(), made.report.vertices, settings);
+                row.baseline = found.map_err(|Canceled| Ended::Stopped)?;
+            }
+            row.report = Some(made.report);
         }
         Guarded::Done(Err(failure::Ended::Failed(failure))) => row.outcome = failed(*failure, expected),
         Guarded::Done(Err(failure::Ended::Canceled)) if task.stop.is_canceled() => return Err(Ended::Stopped),
@@ -162,17 +173,7 @@ fn wrapped(
         }
         Guarded::Crashed(message) => row.outcome = fault("crashed", message),
     }
-    Ok(row)
-}
-
-fn with_baseline(
-    task: &Task<'_>,
-    opened: &Opened,
-    vertices: u64,
-    beside: &mut Beside,
-) -> Result<Option<Baseline>, Ended> {
-    let settings = Settings { pool: task.pool, cancel: task.stop, progress: &|_| {} };
-    beside.get(opened.field.as_ref(), vertices, settings).map_err(|Canceled| Ended::Stopped)
+    Ok((row, picture))
 }
 
 fn fault(code: &str, detail: String) -> Outcome {
@@ -257,6 +258,7 @@ mod tests {
             limit,
             expected: &[],
             keep: None,
+            draw: false,
             pool: &pool,
             stop: &stop,
         };
