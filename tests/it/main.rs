@@ -5,6 +5,7 @@ mod cli;
 mod conditional;
 mod contract;
 mod control;
+mod evaluate;
 mod faults;
 mod metrics;
 mod refusals;

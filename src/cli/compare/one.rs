@@ -5,9 +5,9 @@ use super::fits;
 use super::row::{Outcome, Row, lattice_name};
 use super::shapes::Shape;
 use super::sheet;
+use crate::field::Sampler;
 use crate::field::input::{Description, FieldOptions};
 use crate::field::sampler::Tally;
-use crate::field::{Field, Sampler};
 use crate::job::failure::{self, Failure};
 use crate::job::pipeline::{self, Made, Opened};
 use crate::job::spec::{FieldSpec, OutputName};
@@ -70,7 +70,10 @@ pub fn run(shape: &Shape, task: &Task<'_>, add: Add<'_>) -> Result<(), Ended> {
     let watch = Arc::new(Watch::default());
     let opened = open(shape, &watch).map_err(Ended::Unread)?;
     let load = clock.elapsed().as_secs_f64();
-    let mut beside = Beside::default();
+    let settings = Settings { pool: task.pool, cancel: task.stop, progress: &|_| {} };
+    let tally = Tally::new();
+    let sampler = Sampler::new(opened.field.as_ref(), settings, &tally);
+    let mut beside = Beside::new(&sampler);
     for &lattice in task.lattices {
         let (row, picture) = wrapped(shape, task, &opened, &watch, lattice, load, &mut beside)?;
         add(row, picture).map_err(Ended::Io)?;
@@ -94,21 +97,30 @@ fn open(shape: &Shape, watch: &Arc<Watch>) -> Result<Opened, String> {
     Ok(opened)
 }
 
-/// Marching cubes by its number of samples per side: two lattices may ask for the same.
-#[derive(Default)]
-struct Beside(Vec<(usize, Option<Baseline>)>);
+/// Marching cubes on the field of a shape, by its number of samples per side: two lattices may ask for the same.
+struct Beside<'s, 'a> {
+    sampler: &'s Sampler<'a>,
+    truth: Option<Truth<'s, 'a>>,
+    known: Vec<(usize, Option<Baseline>)>,
+}
 
-impl Beside {
-    fn get(&mut self, field: &dyn Field, vertices: u64, settings: Settings<'_>) -> Result<Option<Baseline>, Canceled> {
-        let tally = Tally::new();
-        let sampler = Sampler::new(field, settings, &tally);
-        let truth = Truth::of(&sampler)?;
-        let Some(side) = side_for(&truth, vertices) else { return Ok(None) };
-        if let Some((_, known)) = self.0.iter().find(|(s, _)| *s == side) {
+impl<'s, 'a> Beside<'s, 'a> {
+    fn new(sampler: &'s Sampler<'a>) -> Self {
+        Self { sampler, truth: None, known: Vec::new() }
+    }
+
+    /// Marching cubes with about as many vertices.
+    fn get(&mut self, vertices: u64) -> Result<Option<Baseline>, Canceled> {
+        let truth = match &mut self.truth {
+            Some(truth) => truth,
+            none => none.insert(Truth::of(self.sampler)?),
+        };
+        let Some(side) = side_for(truth, vertices) else { return Ok(None) };
+        if let Some((_, known)) = self.known.iter().find(|(s, _)| *s == side) {
             return Ok(*known);
         }
-        let found = baseline(&truth, side)?;
-        self.0.push((side, found));
+        let found = baseline(truth, side)?;
+        self.known.push((side, found));
         Ok(found)
     }
 }
@@ -120,7 +132,7 @@ fn wrapped(
     watch: &Watch,
     lattice: LatticeSpec,
     load: f64,
-    beside: &mut Beside,
+    beside: &mut Beside<'_, '_>,
 ) -> Result<(Row, Vec<u8>), Ended> {
     let clock = Instant::now();
     let spec = ShrinkSpec { method: task.method, lattice, ..ShrinkSpec::default() };
@@ -155,13 +167,12 @@ fn wrapped(
             if let Some(folder) = task.keep {
                 keep(folder, shape, lattice, &made).map_err(Ended::Io)?;
             }
-            let settings = Settings { pool: task.pool, cancel: task.stop, progress: &|_| {} };
             if task.draw {
-                picture = sheet::picture(&made, lattice, &settings).map_err(|Canceled| Ended::Stopped)?;
+                picture =
+                    sheet::picture(&made, lattice, beside.sampler.settings()).map_err(|Canceled| Ended::Stopped)?;
             }
             if task.baseline {
-                let found = beside.get(opened.field.as_ref(), made.report.vertices, settings);
-                row.baseline = found.map_err(|Canceled| Ended::Stopped)?;
+                row.baseline = beside.get(made.report.vertices).map_err(|Canceled| Ended::Stopped)?;
             }
             row.report = Some(made.report);
         }

@@ -13,7 +13,7 @@ const NONE: &str = "–";
 pub fn to_text(found: &Evaluation, mesh: &Path, truth: &Path, kind: &str) -> String {
     let name = |path: &Path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
     let mut text = format!(
-        "{} against {} ({kind}).\nDistances and |field| in parts of the diagonal of the truth's bounding box ({:.6} scene \
+        "{} against {} ({kind}).\nDistances and the field's own absolute values in parts of the diagonal of the truth's bounding box ({:.6} scene \
          units). CD, F1, ECD and EF1: 100,000 samples of each side,\nlongest side of the truth at 0.9 (NDC: scene units x \
          {:.6}); the truth against itself is their floor.\n\n",
         name(mesh),
@@ -95,9 +95,9 @@ fn figures(found: &Evaluation) -> Vec<Vec<String>> {
     row("from truth: max", &|f| small(f.distance.truth_to_surface.max));
     row("both: mean", &|f| small(f.distance.mean));
     row("both: max", &|f| small(f.distance.max));
-    row("|field|: mean", &|f| small(f.values.mean));
-    row("|field|: RMS", &|f| small(f.values.rms));
-    row("|field|: max", &|f| small(f.values.max));
+    row("field: mean", &|f| small(f.values.mean));
+    row("field: RMS", &|f| small(f.values.rms));
+    row("field: max", &|f| small(f.values.max));
     row("NC", &|f| format!("{:.4}", f.normal_consistency));
     row("NC, signed", &|f| format!("{:.4}", f.normal_consistency_signed));
     let sampled = |figure: fn(&Chamfer) -> Option<f64>, factor: f64, digits: usize| {
@@ -111,6 +111,7 @@ fn figures(found: &Evaluation) -> Vec<Vec<String>> {
         row("F1 at .003", &sampled(|c| Some(c.f1[1]), 1.0, 4));
         row("F1 at .001", &sampled(|c| Some(c.f1[0]), 1.0, 4));
         row("NC of samples", &sampled(|c| Some(c.normal_consistency), 1.0, 4));
+        row("edge samples", &|f| f.chamfer.map_or(NONE.to_owned(), |c| c.edge_samples[0].to_string()));
         row("ECD2 x 100", &sampled(|c| c.edge_cd2, 100.0, 4));
         row("EF1 at .005", &sampled(|c| c.edge_f1, 1.0, 4));
     }
