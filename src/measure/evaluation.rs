@@ -5,7 +5,7 @@ use super::certificate::{crossings, surface_flips, topology};
 use super::chamfer::{Chamfer, chamfer};
 use super::chart::{ChartFigures, SphereChart, chart_figures};
 use super::distance::{Comparison, FIELD_SAMPLES, Mesh, SAMPLES};
-use super::report::{Conditions, Distance, Flips};
+use super::report::{Distance, MAX_DISTANCE};
 use super::sampling::by_area;
 use super::truth::Truth;
 use crate::field::mesh::ChartedMesh;
@@ -81,26 +81,36 @@ pub struct Evaluation {
 }
 
 impl Evaluation {
-    /// Whether the mesh succeeds, as [`super::report::passes`] has it. A mesh without texture coordinates has no chart, and
-    /// its sphere is only judged where it is known.
+    /// Whether the mesh succeeds, by the conditions of [`super::report::passes`]. A mesh without texture coordinates has no
+    /// chart, and its sphere is only judged where it is known.
     ///
     /// # Errors
     /// One sentence for every condition that does not hold.
     pub fn succeeds(&self) -> Result<(), Vec<String>> {
         let (surface, chart) = (&self.surface, self.parameterization.as_ref());
-        let conditions = Conditions {
-            closed: surface.closed,
-            euler: surface.euler,
-            charts: chart.map_or(0, |c| c.charts),
-            flips: Flips {
-                surface: surface.flips,
-                sphere: chart.and_then(|c| c.sphere_flips).unwrap_or(0),
-                uv: chart.map_or(0, |c| c.uv_flips),
-            },
-            self_intersections: surface.self_intersections,
-            max_distance: surface.distance.max,
-        };
-        conditions.hold()
+        let charts = chart.map_or(0, |c| c.charts);
+        let turned = chart.and_then(|c| c.sphere_flips).unwrap_or(0);
+        let mirrored = chart.map_or(0, |c| c.uv_flips);
+        let max = surface.distance.max;
+        let conditions = [
+            (surface.closed, "the surface is not closed".to_owned()),
+            (surface.euler == 2, format!("the Euler number is {} instead of 2", surface.euler)),
+            (charts == 1, format!("there are {charts} charts instead of 1")),
+            (surface.flips == 0, format!("{} triangles are folded over on the surface", surface.flips)),
+            (turned == 0, format!("{turned} triangles are turned over on the sphere")),
+            (mirrored == 0, format!("{mirrored} triangles are turned over in the chart")),
+            (surface.self_intersections == 0, format!("{} pairs of triangles intersect", surface.self_intersections)),
+            (
+                max <= MAX_DISTANCE,
+                format!(
+                    "the largest distance is {:.3} % of the diagonal, over {} %",
+                    100.0 * max,
+                    100.0 * MAX_DISTANCE
+                ),
+            ),
+        ];
+        let faults: Vec<String> = conditions.into_iter().filter(|c| !c.0).map(|c| c.1).collect();
+        if faults.is_empty() { Ok(()) } else { Err(faults) }
     }
 }
 

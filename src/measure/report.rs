@@ -106,62 +106,27 @@ pub fn measure(
 /// # Errors
 /// One sentence for every condition that does not hold.
 pub fn passes(report: &Report) -> Result<(), Vec<String>> {
-    let conditions = Conditions {
-        closed: report.closed,
-        euler: report.euler,
-        charts: report.charts,
-        flips: report.flips,
-        self_intersections: report.self_intersections,
-        max_distance: report.distance.max,
+    let mut faults = Vec::new();
+    let mut demand = |holds: bool, fault: String| {
+        if !holds {
+            faults.push(fault);
+        }
     };
-    conditions.hold()
-}
-
-/// What success depends on.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Conditions {
-    /// Whether every edge has exactly two triangles, oppositely oriented.
-    pub closed: bool,
-    /// Euler characteristic.
-    pub euler: i64,
-    /// Charts.
-    pub charts: u64,
-    /// Folded triangles.
-    pub flips: Flips,
-    /// Pairs of triangles that meet.
-    pub self_intersections: u64,
-    /// Largest distance both ways, in parts of the truth's diagonal.
-    pub max_distance: f64,
-}
-
-impl Conditions {
-    /// Whether all hold.
-    ///
-    /// # Errors
-    /// One sentence for every condition that does not.
-    pub fn hold(&self) -> Result<(), Vec<String>> {
-        let mut faults = Vec::new();
-        let mut demand = |holds: bool, fault: String| {
-            if !holds {
-                faults.push(fault);
-            }
-        };
-        demand(self.closed, "the surface is not closed".to_owned());
-        demand(self.euler == 2, format!("the Euler number is {} instead of 2", self.euler));
-        demand(self.charts == 1, format!("there are {} charts instead of 1", self.charts));
-        let Flips { surface, sphere, uv } = self.flips;
-        demand(surface == 0, format!("{surface} triangles are folded over on the surface"));
-        demand(sphere == 0, format!("{sphere} triangles are turned over on the sphere"));
-        demand(uv == 0, format!("{uv} triangles are turned over in the chart"));
-        let crossing = self.self_intersections;
-        demand(crossing == 0, format!("{crossing} pairs of triangles intersect"));
-        let max = self.max_distance;
-        demand(
-            max <= MAX_DISTANCE,
-            format!("the largest distance is {:.3} % of the diagonal, over {} %", 100.0 * max, 100.0 * MAX_DISTANCE),
-        );
-        if faults.is_empty() { Ok(()) } else { Err(faults) }
-    }
+    demand(report.closed, "the surface is not closed".to_owned());
+    demand(report.euler == 2, format!("the Euler number is {} instead of 2", report.euler));
+    demand(report.charts == 1, format!("there are {} charts instead of 1", report.charts));
+    let Flips { surface, sphere, uv } = report.flips;
+    demand(surface == 0, format!("{surface} triangles are folded over on the surface"));
+    demand(sphere == 0, format!("{sphere} triangles are turned over on the sphere"));
+    demand(uv == 0, format!("{uv} triangles are turned over in the chart"));
+    let crossing = report.self_intersections;
+    demand(crossing == 0, format!("{crossing} pairs of triangles intersect"));
+    let max = report.distance.max;
+    demand(
+        max <= MAX_DISTANCE,
+        format!("the largest distance is {:.3} % of the diagonal, over {} %", 100.0 * max, 100.0 * MAX_DISTANCE),
+    );
+    if faults.is_empty() { Ok(()) } else { Err(faults) }
 }
 
 /// Field evaluations.
