@@ -259,7 +259,7 @@ mod tests {
                 // spheres of radius 0.45 in NDC, 2 % apart
                 assert!((cd.cd1 / 2.0 / 0.009 - 1.0).abs() < 0.05, "{cd:?}");
                 assert!(floor.cd2 < 0.1 * cd.cd2 && floor.cd2 > 0.0);
-                assert_eq!(found.truth.unwrap().distance.max, 0.0);
+                assert!(found.truth.unwrap().distance.max < 1e-15, "nothing but rounding");
                 assert!(found.marching_cubes.is_empty());
                 let faults = found.succeeds().unwrap_err();
                 assert!(faults.iter().any(|f| f.contains("0 charts")), "{faults:?}");
