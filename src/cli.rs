@@ -3,13 +3,17 @@
 //! Exit codes: 0 done; 1 failed, or made a result that did not pass its own checks; 2 bad usage; 3 bad input; 4 the shape
 //! could not be wrapped.
 
+pub mod compare;
+pub mod evaluate;
 pub mod extract;
 pub mod first_job;
 pub mod healthcheck;
+mod interrupt;
 pub mod serve;
 
 use crate::field::Domain;
 use crate::field::input::{DomainName, DomainOption};
+use crate::measure::chart::SphereChart;
 use crate::shrink::lattice::LatticeSpec;
 use crate::shrink::{Component, Density, Distortion, Method, OnTopology};
 use clap::{Args, Parser, Subcommand, ValueEnum};
@@ -41,6 +45,12 @@ enum Command {
     /// Wrap one field: exits 0 when the result passed every check (closed, Euler characteristic 2, one chart, no flips, no
     /// self-intersections, nowhere farther than 1 % of the diagonal from the zero level set)
     Extract(ExtractArgs),
+    /// Measure a GLB or any mesh against a mesh or a field, beside marching cubes on the same field
+    #[command(after_long_help = EVALUATE_EXAMPLES)]
+    Evaluate(EvaluateArgs),
+    /// Wrap every field of a folder and write a table of how good the results are
+    #[command(after_long_help = COMPARE_EXAMPLES)]
+    Compare(CompareArgs),
     /// Print the description of the service (OpenAPI 3.1, YAML)
     Openapi,
     /// Ask a service whether it is ready: exits 0 when it is
@@ -121,6 +131,117 @@ pub struct ExtractArgs {
     #[arg(long, value_name = "C.svg")]
     pub svg: Option<PathBuf>,
     /// Threads; 0 is one per core. The result does not depend on it
+    #[arg(long, default_value_t = 0)]
+    pub threads: usize,
+}
+
+/// What `evaluate --help` ends with.
+const EVALUATE_EXAMPLES: &str = "\
+Examples:
+  shrinkd extract spot.ply -o spot.glb && shrinkd evaluate spot.glb --truth spot.ply
+  shrinkd evaluate other_program.obj --truth spot.ply --json > spot.json
+  shrinkd evaluate fork.glb --truth examples/scenes/fork.json --no-baseline --check
+
+Exits 0 when it was measured, 1 when --check was asked for and a condition of success does not hold, 2 on bad usage, 3
+when a file cannot be read as a mesh or a field.";
+
+/// Arguments of `evaluate`.
+#[derive(Debug, Args)]
+pub struct EvaluateArgs {
+    /// What is measured: a mesh (GLB, PLY, OBJ, STL, OFF), whoever made it
+    pub mesh: PathBuf,
+    /// What it is measured against: a mesh, a scene, a network or a sampled grid
+    #[arg(long, value_name = "MESH|FIELD")]
+    pub truth: PathBuf,
+    /// Print JSON in place of the table
+    #[arg(long)]
+    pub json: bool,
+    /// Exit 1 when it is not closed, of Euler number 2, one chart, without flips and self-intersections, and within 1 % of
+    /// the diagonal
+    #[arg(long)]
+    pub check: bool,
+    /// What the texture coordinates are, where the file does not say so itself
+    #[arg(long, value_enum)]
+    pub chart: Option<ChartArg>,
+    /// Leave out marching cubes
+    #[arg(long)]
+    pub no_baseline: bool,
+    /// Latent code of an auto-decoder that is the truth: a JSON list of numbers
+    #[arg(long, value_name = "FILE.json", conflicts_with = "latent_row")]
+    pub latent: Option<PathBuf>,
+    /// Row of the truth's own table of latent codes
+    #[arg(long, value_name = "N")]
+    pub latent_row: Option<u32>,
+    /// Box that holds the truth's zero level set (of a grid: that its samples span): fit, or X0,Y0,Z0,X1,Y1,Z1
+    #[arg(long, value_name = "BOX", value_parser = parse_domain, allow_hyphen_values = true)]
+    pub domain: Option<DomainOption>,
+    /// Threads; 0 is one per core. The result does not depend on it
+    #[arg(long, default_value_t = 0)]
+    pub threads: usize,
+}
+
+/// Charts in which every place is a direction on the sphere.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum ChartArg {
+    /// u is the longitude, v the latitude from the north pole
+    Latlong,
+    /// The unfolded octahedron of equal areas
+    Octahedral,
+}
+
+impl From<ChartArg> for SphereChart {
+    fn from(chart: ChartArg) -> Self {
+        match chart {
+            ChartArg::Latlong => SphereChart::Latlong,
+            ChartArg::Octahedral => SphereChart::Octahedral,
+        }
+    }
+}
+
+/// What `compare --help` ends with.
+const COMPARE_EXAMPLES: &str = "\
+Examples:
+  shrinkd compare examples/scenes
+  shrinkd compare meshes --out results --expect-refusal 'genus/*'
+  shrinkd compare meshes --only spot --only bunny --lattice octahedral:144 --no-baseline
+
+Exits 0 when every shape succeeded or was refused as expected, 1 when one did not or the run was interrupted, 2 on bad
+usage, 3 when the folder cannot be read or holds no field.";
+
+/// Arguments of `compare`.
+#[derive(Debug, Args)]
+pub struct CompareArgs {
+    /// The folder; scenes, networks, meshes and grids in it and in the folders below are told by their content
+    pub dir: PathBuf,
+    /// Where the sphere is sampled: latlong:N_THETAxN_PHI or octahedral:N; several times for several
+    /// [default: latlong:200x100 and octahedral:72]
+    #[arg(long, value_parser = parse_lattice)]
+    pub lattice: Vec<LatticeSpec>,
+    /// How the sphere is contracted
+    #[arg(long, value_enum, default_value_t = MethodArg::Adaptive)]
+    pub method: MethodArg,
+    /// Folder for compare.md and compare.json, written as results come, and a contact sheet of pictures for every lattice
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Where the JSON goes [default: compare.json in the folder of --out]
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+    /// Take only shapes whose path in the folder holds this text, or fits this pattern with `*`; may be repeated
+    #[arg(long, value_name = "PATTERN")]
+    pub only: Vec<String>,
+    /// Shapes that a sphere cannot wrap and that must be refused, told as for --only; may be repeated
+    #[arg(long, value_name = "PATTERN")]
+    pub expect_refusal: Vec<String>,
+    /// Leave out marching cubes of as many vertices
+    #[arg(long)]
+    pub no_baseline: bool,
+    /// Seconds that a shape may take on one lattice; over that it counts as failed
+    #[arg(long, value_name = "SECONDS")]
+    pub limit: Option<u64>,
+    /// Keep the surfaces too, in the folder `glb` of --out
+    #[arg(long, requires = "out")]
+    pub glb: bool,
+    /// Threads; 0 is one per core. The results do not depend on it
     #[arg(long, default_value_t = 0)]
     pub threads: usize,
 }
@@ -245,6 +366,8 @@ pub fn run() -> ExitCode {
     match Cli::parse().command {
         Command::Serve(args) => serve::run(&args),
         Command::Extract(args) => extract::run(&args),
+        Command::Evaluate(args) => evaluate::run(&args),
+        Command::Compare(args) => compare::run(&args),
         Command::Openapi => openapi(),
         Command::Healthcheck { url } => healthcheck::run(&url),
     }

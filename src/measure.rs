@@ -4,17 +4,21 @@
 //! Every definition is in `docs/metrics.md`. Nothing here depends on the number of threads: work is cut into fixed chunks
 //! whose results are gathered in order.
 
+pub mod baseline;
 pub mod bvh;
 pub mod certificate;
 pub mod chamfer;
+pub mod chart;
 pub mod distance;
 pub mod distortion;
+pub mod evaluation;
 pub mod intersection;
 pub mod marching_cubes;
 pub mod nearest;
 pub mod predicates;
 pub mod report;
 pub mod sampling;
+pub mod truth;
 pub mod verdict;
 pub mod zero_set;
 

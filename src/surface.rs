@@ -4,8 +4,10 @@ pub mod checkerboard;
 pub mod curve;
 pub mod forms;
 pub mod gltf;
+pub mod lettering;
 pub mod preview;
 pub mod raster;
+pub mod sheet;
 pub mod tensors;
 
 use crate::shrink::Wrap;

@@ -33,7 +33,7 @@ fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
     let clock = Instant::now();
     let bytes = std::fs::read(&args.field).map_err(|e| (BAD_INPUT, format!("{}: {e}", args.field.display())))?;
     let options = FieldOptions {
-        latent: read_latent(args)?,
+        latent: read_latent(args.latent.as_deref())?,
         latent_row: args.latent_row,
         domain: args.domain,
         ..FieldOptions::default()
@@ -127,8 +127,9 @@ fn wanted(args: &ExtractArgs) -> Vec<(OutputName, PathBuf)> {
     files.into_iter().filter_map(|(output, path)| Some((output, path?.clone()))).collect()
 }
 
-fn read_latent(args: &ExtractArgs) -> Result<Option<Vec<f32>>, (u8, String)> {
-    let Some(path) = &args.latent else { return Ok(None) };
+/// A latent code from a file: a JSON list of finite numbers.
+pub(super) fn read_latent(path: Option<&Path>) -> Result<Option<Vec<f32>>, (u8, String)> {
+    let Some(path) = path else { return Ok(None) };
     let wrong = |e: &dyn std::fmt::Display| (BAD_INPUT, format!("{}: {e}", path.display()));
     let text = std::fs::read(path).map_err(|e| wrong(&e))?;
     let latent: Vec<f32> = serde_json::from_slice(&text).map_err(|e| wrong(&e))?;

@@ -44,6 +44,35 @@ pub struct TriangleMesh {
     pub triangles: Vec<[u32; 3]>,
 }
 
+/// A mesh as it stands in a file, with a place in the chart for every vertex: vertices on a seam are there once per side.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ChartedMesh {
+    /// Vertex positions.
+    pub vertices: Vec<[f64; 3]>,
+    /// Texture coordinates of every vertex, v downwards.
+    pub uv: Vec<[f32; 2]>,
+    /// Triangles, indices into both.
+    pub triangles: Vec<[u32; 3]>,
+    /// The `extras` of the document; null when there are none.
+    pub extras: serde_json::Value,
+}
+
+impl ChartedMesh {
+    /// Reads the mesh of a GLB with its first texture coordinates. `None` when the bytes are of another format, when a
+    /// primitive has no texture coordinates, or one of them is not finite.
+    ///
+    /// # Errors
+    /// As [`TriangleMesh::read`].
+    pub fn read(bytes: &[u8]) -> Result<Option<Self>, FieldError> {
+        if MeshFormat::detect(bytes) != Some(MeshFormat::Glb) {
+            return Ok(None);
+        }
+        let (soup, extras) = glb::read_charted(bytes)?;
+        let uv = soup.places.filter(|places| places.iter().flatten().all(|c| c.is_finite()));
+        Ok(uv.map(|uv| Self { vertices: soup.vertices, uv, triangles: soup.triangles, extras }))
+    }
+}
+
 /// The mesh formats that are read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MeshFormat {
@@ -131,6 +160,8 @@ struct Soup {
     format: &'static str,
     vertices: Vec<[f64; 3]>,
     triangles: Vec<[u32; 3]>,
+    /// Texture coordinates by vertex, for a reader that was asked for them.
+    places: Option<Vec<[f32; 2]>>,
 }
 
 impl Soup {

@@ -18,7 +18,7 @@ pub const F1_AT: [f64; 2] = [0.001, 0.003];
 pub const EF1_AT: f64 = 0.005;
 
 /// Sample-to-sample measures, in the units of the meshes (NDC: the longest side is 0.9).
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize)]
 pub struct Chamfer {
     /// mean d(G -> P) + mean d(P -> G).
     pub cd1: f64,
@@ -28,6 +28,8 @@ pub struct Chamfer {
     pub f1: [f64; 2],
     /// Mean over both directions of |n . n'|, face normals of nearest samples.
     pub normal_consistency: f64,
+    /// Edge samples of the surface and of the truth; figures of a few are noise.
+    pub edge_samples: [usize; 2],
     /// CD2 between edge samples; `None` when either side has none.
     pub edge_cd2: Option<f64>,
     /// F1 between edge samples at [`EF1_AT`]; `None` when either side has none.
@@ -115,6 +117,7 @@ pub fn chamfer(
         cd2: p2 + g2,
         f1: [0, 1].map(|i| f1(precision[i], recall[i])),
         normal_consistency: 0.5 * (pc + gc),
+        edge_samples: [pe.points.len(), ge.points.len()],
         edge_cd2,
         edge_f1,
     }))
@@ -134,7 +137,7 @@ mod tests {
         let expected = 2.0 / (std::f64::consts::PI * 20_000.0);
         assert!((c.cd2 / expected - 1.0).abs() < 0.05, "{} {expected}", c.cd2);
         assert!(c.normal_consistency > 0.999_999 && c.f1[1] > 0.3 && c.f1[1] > c.f1[0]);
-        assert_eq!(c.edge_cd2, None, "a plane has no edge");
+        assert_eq!((c.edge_cd2, c.edge_samples), (None, [0, 0]), "a plane has no edge");
     }
 
     #[test]
@@ -153,6 +156,6 @@ mod tests {
         let vertices = [DVec3::ZERO, DVec3::X, DVec3::Y, DVec3::Z].map(|p| 0.1 * p);
         let mesh = Mesh { vertices: &vertices, triangles: &[[0, 1, 2], [0, 3, 1]] };
         let c = with_settings(1, |s| chamfer(mesh, mesh, 20_000, s).unwrap().unwrap());
-        assert!(c.edge_f1.unwrap() > 0.99, "{c:?}");
+        assert!(c.edge_f1.unwrap() > 0.99 && c.edge_samples.iter().all(|&n| n > 100), "{c:?}");
     }
 }

@@ -5,7 +5,9 @@ use super::certificate::positions;
 use super::nearest::Nearest;
 use super::report::{Distance, MAX_DISTANCE, OneWay};
 use super::sampling::{Samples, by_area};
-use super::{corners, diagonal, doubled_normal, zero_set};
+use super::truth::Truth;
+use super::zero_set::{self, ZeroSet};
+use super::{corners, diagonal, doubled_normal};
 use crate::field::mesh::TriangleMesh;
 use crate::field::{Metric, Sampler};
 use crate::settings::{Canceled, Settings};
@@ -47,6 +49,8 @@ pub struct Comparison {
     /// Places of either side that are farther than [`MAX_DISTANCE`] from the other, scene units: the farthest first, and
     /// of those close together one; at most 16.
     pub far: Vec<DVec3>,
+    /// Where the largest distances were met, scene units: on the surface, on the truth.
+    pub worst_places: [DVec3; 2],
 }
 
 /// Distances and cosines of normals from samples of one side, weighted.
@@ -56,6 +60,7 @@ struct Tallied {
     sum: f64,
     squares: f64,
     max: f64,
+    worst: DVec3,
     cosine: f64,
     cosine_absolute: f64,
     /// Distance and place of what is farther than the bar.
@@ -67,14 +72,15 @@ impl Tallied {
         self.weight += weight;
         self.sum += weight * distance;
         self.squares += weight * distance * distance;
-        self.max = self.max.max(distance);
         self.cosine += weight * cosine;
         self.cosine_absolute += weight * cosine.abs();
     }
     /// Notes the places whose distance is over `bar`, and the largest distance of all.
     fn extremes(&mut self, bar: f64, list: impl Iterator<Item = (f64, DVec3)>) {
         for (distance, place) in list {
-            self.max = self.max.max(distance);
+            if distance > self.max {
+                (self.max, self.worst) = (distance, place);
+            }
             if distance > bar {
                 self.far.push((distance, place));
             }
@@ -101,11 +107,12 @@ fn both(there: Tallied, back: Tallied, size: f64) -> Comparison {
             mean: 0.5 * (a.mean + b.mean),
             rms: (0.5 * (a.rms * a.rms + b.rms * b.rms)).sqrt(),
             max: a.max.max(b.max),
-            surface_to_truth,
-            truth_to_surface,
+            surface_to_truth: a,
+            truth_to_surface: b,
         },
         normal_consistency: 0.5 * (a.normal_consistency + b.normal_consistency),
         normal_consistency_signed: 0.5 * (a.normal_consistency_signed + b.normal_consistency_signed),
+        worst_places: [there.worst, back.worst],
     }
 }
 
@@ -182,9 +189,21 @@ fn one_way(
 /// # Errors
 /// When the token is raised.
 pub fn to_field(surface: Mesh<'_>, samples: usize, sampler: &Sampler<'_>) -> Result<Option<Comparison>, Canceled> {
+    to_zero_set(surface, samples, &zero_set::find(sampler)?, sampler)
+}
+
+/// As [`to_field`], with the points on its zero level set found already.
+///
+/// # Errors
+/// When the token is raised.
+pub fn to_zero_set(
+    surface: Mesh<'_>,
+    samples: usize,
+    zeros: &ZeroSet,
+    sampler: &Sampler<'_>,
+) -> Result<Option<Comparison>, Canceled> {
     let settings = sampler.settings();
     let on_surface = by_area(surface.vertices, surface.triangles, samples, SEEDS[0]);
-    let zeros = zero_set::find(sampler)?;
     if on_surface.points.is_empty() || zeros.points.is_empty() {
         return Ok(None);
     }
@@ -193,7 +212,7 @@ pub fn to_field(surface: Mesh<'_>, samples: usize, sampler: &Sampler<'_>) -> Res
 
     let mut starts = on_surface.points.clone();
     starts.extend_from_slice(surface.vertices);
-    let landed = land(&starts, &zeros, REACH * size, sampler)?;
+    let landed = land(&starts, zeros, REACH * size, sampler)?;
     let mut there = Tallied::default();
     for (i, (distance, normal)) in landed.iter().enumerate() {
         if let Some(&t) = on_surface.triangles.get(i) {
@@ -213,12 +232,7 @@ pub fn to_field(surface: Mesh<'_>, samples: usize, sampler: &Sampler<'_>) -> Res
 }
 
 /// Distance from every start to the zero set, and the unit gradient where it lands.
-fn land(
-    starts: &[DVec3],
-    zeros: &zero_set::ZeroSet,
-    reach: f64,
-    sampler: &Sampler<'_>,
-) -> Result<Vec<(f64, DVec3)>, Canceled> {
+fn land(starts: &[DVec3], zeros: &ZeroSet, reach: f64, sampler: &Sampler<'_>) -> Result<Vec<(f64, DVec3)>, Canceled> {
     if sampler.field().metric() == Metric::Exact {
         // the gradient is the same all along the way to the closest point
         let (values, gradients) = sampler.gradients(starts)?;
@@ -247,15 +261,7 @@ pub fn mesh_vertices(mesh: &TriangleMesh) -> Vec<DVec3> {
 /// When the token is raised.
 pub fn to_truth(surface: &Surface, sampler: &Sampler<'_>) -> Result<Option<Comparison>, Canceled> {
     let vertices = positions(surface);
-    let mesh = Mesh { vertices: &vertices, triangles: &surface.triangles };
-    match sampler.field().truth() {
-        Some(truth) => {
-            let truth_vertices = mesh_vertices(truth);
-            let truth = Mesh { vertices: &truth_vertices, triangles: &truth.triangles };
-            between(mesh, truth, SAMPLES, sampler.settings())
-        }
-        None => to_field(mesh, FIELD_SAMPLES, sampler),
-    }
+    Truth::of(sampler)?.compare(Mesh { vertices: &vertices, triangles: &surface.triangles })
 }
 
 #[cfg(test)]
@@ -311,10 +317,12 @@ mod tests {
         let n = vertices.len() as u32;
         let both: Vec<[u32; 3]> = triangles.iter().copied().chain(triangles.iter().map(|t| t.map(|v| v + n))).collect();
         let (a, b) = (Mesh { vertices: &vertices, triangles: &triangles }, Mesh { vertices: &all, triangles: &both });
-        let c = with_settings(1, |s| between(a, b, 1000, s).unwrap().unwrap()).distance;
+        let Comparison { distance: c, worst_places: worst, .. } =
+            with_settings(1, |s| between(a, b, 1000, s).unwrap().unwrap());
         assert!(c.surface_to_truth.max < 1e-15);
         let size = DVec3::new(3.1, 2.0, 2.0).length();
         assert!((c.truth_to_surface.max * size - 1.1).abs() < 1e-3, "{c:?}");
+        assert!(worst[1].distance(2.1 * DVec3::X) < 0.05, "{worst:?}");
     }
 
     fn against_field(field: &dyn Field, radius: f64) -> Comparison {

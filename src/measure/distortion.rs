@@ -75,7 +75,7 @@ pub fn distortion(triangles: impl Iterator<Item = ([DVec2; 3], [DVec3; 3])>) -> 
 }
 
 /// A triangle in its own plane: the first corner at the origin, the first edge along x, counter-clockwise.
-fn flatten([a, b, c]: [DVec3; 3]) -> [DVec2; 3] {
+pub(super) fn flatten([a, b, c]: [DVec3; 3]) -> [DVec2; 3] {
     let (ab, ac) = (b - a, c - a);
     let x = ab.normalize_or(DVec3::X);
     let along = ac.dot(x);

@@ -6,6 +6,7 @@ mod cli;
 mod conditional;
 mod contract;
 mod control;
+mod evaluate;
 mod faults;
 mod metrics;
 mod refusals;

@@ -24,6 +24,7 @@ struct Document {
     buffer_views: Vec<View>,
     buffers: Vec<Buffer>,
     extensions_required: Vec<String>,
+    extras: serde_json::Value,
 }
 
 #[derive(Deserialize, Default)]
@@ -77,6 +78,8 @@ struct Primitive {
 struct Attributes {
     #[serde(rename = "POSITION")]
     position: Option<usize>,
+    #[serde(rename = "TEXCOORD_0")]
+    place: Option<usize>,
 }
 
 #[derive(Deserialize)]
@@ -108,6 +111,16 @@ struct Buffer {
 }
 
 pub(super) fn read(bytes: &[u8]) -> Result<Soup, FieldError> {
+    collect(bytes, Soup::new(FORMAT)).map(|(soup, _)| soup)
+}
+
+/// The same with a place in the chart for every vertex, and the document's `extras`. The places are gone from the soup when
+/// a primitive has none.
+pub(super) fn read_charted(bytes: &[u8]) -> Result<(Soup, serde_json::Value), FieldError> {
+    collect(bytes, Soup { places: Some(Vec::new()), ..Soup::new(FORMAT) })
+}
+
+fn collect(bytes: &[u8], mut soup: Soup) -> Result<(Soup, serde_json::Value), FieldError> {
     let (json, json_at, binary) = chunks(bytes)?;
     let document: Document = serde_json::from_slice(json).map_err(|e| {
         malformed(FORMAT, Some(json_at), format!("the JSON chunk, line {} column {}: {e}", e.line(), e.column()))
@@ -121,7 +134,6 @@ pub(super) fn read(bytes: &[u8]) -> Result<Soup, FieldError> {
     if document.nodes.len() > MAX_NODES {
         return Err(limit("nodes of a GLB", document.nodes.len(), MAX_NODES));
     }
-    let mut soup = Soup::new(FORMAT);
     let mut reached = vec![false; document.nodes.len()];
     let mut stack: Vec<(usize, DMat4)> = Vec::new();
     match document.scenes.get(document.scene.unwrap_or(0)) {
@@ -145,7 +157,7 @@ pub(super) fn read(bytes: &[u8]) -> Result<Soup, FieldError> {
             add_mesh(&document, mesh, transform, binary, &mut soup)?;
         }
     }
-    Ok(soup)
+    Ok((soup, document.extras))
 }
 
 fn fault(detail: String) -> FieldError {
@@ -216,6 +228,22 @@ fn add_mesh(
             soup.vertex(placed.to_array(), at)?;
         }
         let count = positions.count;
+        if let Some(mut places) = soup.places.take() {
+            soup.places = match primitive.attributes.place {
+                None => None,
+                Some(place) => {
+                    let elements = Elements::of(document, place, binary, "VEC2")?;
+                    if elements.count != count {
+                        let found = elements.count;
+                        return Err(fault(format!("{count} positions have {found} texture coordinates")));
+                    }
+                    for i in 0..count {
+                        places.push(elements.pair(i)?);
+                    }
+                    Some(places)
+                }
+            };
+        }
         let indices = primitive.indices.map(|index| Elements::of(document, index, binary, "SCALAR")).transpose()?;
         let corners = indices.as_ref().map_or(count, |e| e.count);
         let corner = |i: usize| -> Result<u32, FieldError> {
@@ -271,7 +299,12 @@ impl<'a> Elements<'a> {
             5125 | 5126 => 4,
             other => return Err(fault(format!("accessor {index} has the unknown component type {other}"))),
         };
-        let size = component_size * if kind == "VEC3" { 3 } else { 1 };
+        let parts = match kind {
+            "VEC3" => 3,
+            "VEC2" => 2,
+            _ => 1,
+        };
+        let size = component_size * parts;
         let view = accessor.buffer_view.ok_or_else(|| fault(format!("accessor {index} has no buffer view")))?;
         let view =
             document.buffer_views.get(view).ok_or_else(|| fault(format!("no buffer view has the index {view}")))?;
@@ -299,6 +332,20 @@ impl<'a> Elements<'a> {
     fn element(&self, i: usize) -> (usize, &'a [u8]) {
         let at = self.start + i * self.stride;
         (at, &self.binary[at..at + self.size])
+    }
+
+    /// Texture coordinates, which may be normalized integers (glTF 2.0, section 3.7.2.1).
+    fn pair(&self, i: usize) -> Result<[f32; 2], FieldError> {
+        match (self.component, self.element(i).1) {
+            (5126, &[a, b, c, d, e, f, g, h]) => {
+                Ok([f32::from_le_bytes([a, b, c, d]), f32::from_le_bytes([e, f, g, h])])
+            }
+            (5123, &[a, b, c, d]) => {
+                Ok([[a, b], [c, d]].map(|short| f32::from(u16::from_le_bytes(short)) / f32::from(u16::MAX)))
+            }
+            (5121, &[a, b]) => Ok([a, b].map(|byte| f32::from(byte) / f32::from(u8::MAX))),
+            (other, _) => Err(unsupported(format!("texture coordinates of component type {other}"))),
+        }
     }
 
     fn index(&self, i: usize) -> Result<usize, FieldError> {

@@ -212,6 +212,25 @@ fn glb_features_that_are_not_read_are_refused_by_name() {
     }
 }
 
+#[test]
+fn a_glb_with_texture_coordinates_is_read_as_it_stands() {
+    use crate::measure::fixtures::sphere_surface;
+    use crate::shrink::lattice::LatticeSpec;
+    let surface = sphere_surface(LatticeSpec::Octahedral { n: 4 }, 0.5);
+    let bytes = crate::surface::gltf::to_glb(&surface, &serde_json::json!({"n": 4}), &serde_json::Value::Null);
+    let charted = ChartedMesh::read(&bytes).unwrap().unwrap();
+    assert_eq!(charted.triangles, surface.chart_triangles);
+    let uv: Vec<[f32; 2]> = surface.lattice.uv.iter().map(|uv| uv.map(|c| c as f32)).collect();
+    assert_eq!(charted.uv, uv);
+    assert_eq!(charted.extras["report"]["n"], 4);
+    assert_eq!(ChartedMesh::read(&glb(|_| {})), Ok(None), "no texture coordinates");
+    assert_eq!(ChartedMesh::read(OFF), Ok(None));
+    let short = glb(|json| {
+        json["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"] = 0.into();
+    });
+    assert!(matches!(ChartedMesh::read(&short), Err(FieldError::Malformed { .. })), "positions are no pairs");
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(200))]
 
