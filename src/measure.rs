@@ -7,6 +7,7 @@
 pub mod bvh;
 pub mod certificate;
 pub mod chamfer;
+pub mod curve;
 pub mod distance;
 pub mod distortion;
 pub mod intersection;

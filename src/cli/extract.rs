@@ -135,9 +135,9 @@ fn curve_summary(args: &ExtractArgs, svg: &Path, made: &CurveMade, seconds: f64)
         name(&args.field),
         name(&args.output),
         name(svg),
-        report.samples,
-        report.evaluations.total() as f64 / report.samples.max(1) as f64,
+        report.vertices,
+        report.evaluations.per_vertex,
         report.self_intersections,
-        100.0 * report.to_zero_set.max.max(report.from_zero_set.max),
+        100.0 * report.distance.max,
     )
 }

@@ -7,10 +7,10 @@ use crate::field::input::{self, Description};
 use crate::field::sampler::Tally;
 use crate::field::scene::Scene;
 use crate::field::{Field, FieldError, Sampler};
+use crate::measure::curve::CurveReport;
 use crate::measure::{self, Report};
 use crate::settings::{Progress, Settings};
-use crate::shrink::curve::{CurveReport, CurveSpec, shrink_curve};
-use crate::shrink::lattice::LatticeSpec;
+use crate::shrink::curve::{CurveSpec, shrink_curve};
 use crate::shrink::{Effort, ShrinkSpec, shrink};
 use crate::surface::{self, Surface};
 use serde_json::{Value, json};
@@ -162,13 +162,13 @@ impl CurveMade {
 
 /// Shrinks a circle onto a field of dimension 2, with as many samples as a row of the lattice has.
 pub fn make_curve(field: &dyn Field, spec: &ShrinkSpec, settings: Settings<'_>) -> Result<CurveMade, Ended> {
-    let samples = match spec.lattice {
-        LatticeSpec::Latlong { n_theta, .. } => n_theta,
-        LatticeSpec::Octahedral { n } => 4 * n,
-    };
     let tally = Tally::new();
     let sampler = Sampler::new(field, settings, &tally);
-    let curve = shrink_curve(&sampler, &CurveSpec { method: spec.method, samples })?;
-    let report = curve.report;
-    Ok(CurveMade { glb: surface::curve::to_glb(&curve), svg: surface::curve::to_svg(&curve).into_bytes(), report })
+    let curve = shrink_curve(&sampler, &CurveSpec::from(spec), &Effort::default())?;
+    let report = measure::curve::measure(&curve, &sampler, &tally.by_stage(), spec.method)?.report;
+    Ok(CurveMade {
+        glb: surface::curve::to_glb(&curve, &json!(report), &Value::Null),
+        svg: surface::curve::to_svg(&curve).into_bytes(),
+        report,
+    })
 }
