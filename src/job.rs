@@ -130,7 +130,7 @@ pub struct ProgressView {
 /// One finished output of a job.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Output {
-    /// Its name: `glb`, `surface`, `preview` or `report`.
+    /// Its name: `glb`, `surface`, `svg`, `preview` or `report`.
     pub name: String,
     /// Where it is downloaded.
     pub href: String,
@@ -174,7 +174,7 @@ pub struct Job {
     pub eta_s: Option<f64>,
     /// What was measured about the result, once it succeeded: the same object as the output `report`.
     // kept as a value, so that records of another version can still be shown
-    #[schema(value_type = Option<crate::measure::Report>)]
+    #[schema(value_type = Option<crate::measure::AnyReport>)]
     pub metrics: Option<serde_json::Value>,
     /// What it made, once it succeeded.
     pub outputs: Vec<Output>,

@@ -57,6 +57,7 @@ pub struct ShrinkSpec {
     /// Which component to wrap where there are several; without it several are refused.
     pub component: Option<Component>,
     /// Samples of the curve that a 2-D field gives; without it, as many as the lattice has columns. A 3-D field has none.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub samples: Option<u32>,
 }
 

@@ -1,6 +1,6 @@
 //! `shrinkd extract`: one field in, files out, and one line that says how good they are.
 
-use super::{BAD_INPUT, ExtractArgs, FAILED, NOT_WRAPPED, fail};
+use super::{BAD_INPUT, BAD_USAGE, ExtractArgs, FAILED, NOT_WRAPPED, fail};
 use crate::field::input::FieldOptions;
 use crate::job::failure::Ended;
 use crate::job::pipeline::{self, CurveMade, Made};
@@ -19,10 +19,7 @@ const STEPS: u64 = 1000;
 pub fn run(args: &ExtractArgs) -> ExitCode {
     match extract(args) {
         Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => fail(
-            FAILED,
-            &"the result did not pass its own checks (a surface: closed, Euler characteristic 2, no flips; a curve: closed, simple)",
-        ),
+        Ok(false) => fail(FAILED, &"the result did not pass its own checks (closed, Euler characteristic 2, no flips)"),
         Err((code, error)) => fail(code, &error),
     }
 }
@@ -51,7 +48,12 @@ fn extract(args: &ExtractArgs) -> Result<bool, (u8, String)> {
         bar.set_message(progress.stage);
     };
     let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress };
-    let shrink = ShrinkSpec { method: args.method.into(), lattice: args.lattice, ..ShrinkSpec::default() };
+    let shrink = ShrinkSpec {
+        method: args.method.into(),
+        lattice: args.lattice,
+        samples: args.samples,
+        ..ShrinkSpec::default()
+    };
     let load = clock.elapsed().as_secs_f64();
     let ended = |ended: Ended| match ended {
         Ended::Failed(failure) if failure.is_bad_input() => (BAD_INPUT, in_field(&failure.detail)),
@@ -59,13 +61,29 @@ fn extract(args: &ExtractArgs) -> Result<bool, (u8, String)> {
         Ended::Canceled => (FAILED, "canceled".to_owned()),
     };
     if opened.field.dimension() == 2 {
-        let made = pipeline::make_curve(opened.field.as_ref(), &shrink, settings).map_err(ended)?;
-        bar.finish_and_clear();
         let svg = args.svg.clone().unwrap_or_else(|| args.output.with_extension("svg"));
-        write(&args.output, &made.glb)?;
-        write(&svg, &made.svg)?;
+        let mut files = wanted(args);
+        files.push((OutputName::Svg, svg.clone()));
+        files.sort();
+        let outputs: Vec<OutputName> = files.iter().map(|(output, _)| *output).collect();
+        let made = pipeline::make_curve(&opened, &shrink, &outputs, load, settings).map_err(ended)?;
+        bar.finish_and_clear();
+        for ((_, path), (_, bytes)) in files.iter().zip(&made.files) {
+            write(path, bytes)?;
+        }
         println!("{}", curve_summary(args, &svg, &made, clock.elapsed().as_secs_f64()));
-        return Ok(made.is_sound());
+        if made.is_sound() {
+            return Ok(true);
+        }
+        let at: Vec<String> = made.places.iter().take(4).map(|[x, y, _]| format!("({x:.4}, {y:.4})")).collect();
+        let at = if at.is_empty() { String::new() } else { format!(" at {}", at.join(", ")) };
+        return Err((
+            FAILED,
+            in_field(&format!("the curve was written, and it did not pass: {}{at}", made.faults.join("; "))),
+        ));
+    }
+    if args.samples.is_some() || args.svg.is_some() {
+        return Err((BAD_USAGE, in_field("--samples and --svg are for fields of dimension 2")));
     }
     let files = wanted(args);
     let outputs: Vec<OutputName> = files.iter().map(|(output, _)| *output).collect();

@@ -166,7 +166,7 @@ impl Worker {
         claim: Claim,
         cancel: CancelToken,
         news: mpsc::UnboundedSender<Update>,
-    ) -> impl Future<Output = Result<pipeline::Made, Ended>> + Send + use<> {
+    ) -> impl Future<Output = Result<pipeline::Finished, Ended>> + Send + use<> {
         let (blobs, pool) = (self.blobs.clone(), self.pool.clone());
         async move {
             let clock = Instant::now();
@@ -193,7 +193,7 @@ impl Worker {
                 let progress = |progress: Progress| teller.tell(progress);
                 let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress };
                 let load = clock.elapsed().as_secs_f64();
-                pipeline::make(&opened, &claim.spec.shrink, &claim.spec.outputs, load, settings)
+                pipeline::run(&opened, &claim.spec.shrink, &claim.spec.outputs, load, settings)
             };
             tokio::task::spawn_blocking(compute).await.unwrap_or_else(|panic| {
                 tracing::error!(%panic, "the computation panicked");
@@ -203,7 +203,7 @@ impl Worker {
     }
 
     /// Stores the outputs; they are durable before the outcome that names them is told.
-    async fn store(&self, claim: &Claim, made: pipeline::Made) -> Outcome {
+    async fn store(&self, claim: &Claim, made: pipeline::Finished) -> Outcome {
         let mut outputs = Vec::new();
         for (name, bytes) in made.files {
             let size = bytes.len() as u64;
@@ -221,8 +221,10 @@ impl Worker {
                 }
             }
         }
-        let metrics = serde_json::to_value(&made.report).unwrap_or_default();
-        Outcome::Succeeded { outputs, metrics }
+        match made.problem {
+            None => Outcome::Succeeded { outputs, metrics: made.metrics },
+            Some(problem) => Outcome::Failed(problem),
+        }
     }
 
     async fn end(&self, claim: &Claim, outcome: Outcome) {

@@ -5,6 +5,7 @@ mod cli;
 mod conditional;
 mod contract;
 mod control;
+mod curves;
 mod faults;
 mod metrics;
 mod refusals;

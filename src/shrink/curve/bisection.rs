@@ -9,11 +9,32 @@ use crate::field::Sampler;
 use crate::settings::Canceled;
 use glam::{DVec2, DVec3};
 use std::collections::HashMap;
+use std::hash::{BuildHasherDefault, Hasher};
 
 /// Half extent of the square; beyond the domain, which ends at 1, so that its border is outside.
 pub(super) const REACH: f64 = 1.03;
 /// Finest steps along a side: 3e-5 of the frame each, some 200 times what single precision tells apart.
 pub(super) const SIDE: u32 = 1 << 16;
+
+/// A map by places on the finest steps. They are looked up at every step of every walk, so their hash is a short one; nobody
+/// chooses them who could profit from collisions.
+pub(super) type Map<K, V> = HashMap<K, V, BuildHasherDefault<Mix>>;
+
+/// Multiplies by the golden ratio's fraction of 2^64 (Knuth), and folds the high half into the low one.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Mix(u64);
+
+impl Hasher for Mix {
+    fn finish(&self) -> u64 {
+        self.0 ^ (self.0 >> 32)
+    }
+    fn write(&mut self, bytes: &[u8]) {
+        bytes.iter().for_each(|&b| self.write_u32(u32::from(b)));
+    }
+    fn write_u32(&mut self, x: u32) {
+        self.0 = (self.0.rotate_left(29) ^ u64::from(x)).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    }
+}
 
 /// A vertex by its place, in finest steps.
 pub(super) type Vertex = (u32, u32);
@@ -65,7 +86,7 @@ fn parents((x, y): Vertex) -> impl Iterator<Item = Vertex> {
 
 /// Vertices with their values.
 pub(super) struct Mesh {
-    values: HashMap<Vertex, f64>,
+    values: Map<Vertex, f64>,
 }
 
 impl Mesh {
@@ -76,7 +97,7 @@ impl Mesh {
     pub fn new(sampler: &Sampler<'_>, cells: u32) -> Result<Self, Canceled> {
         let step = SIDE / cells;
         let vertices = (0..=cells).flat_map(|j| (0..=cells).map(move |i| (i * step, j * step))).collect();
-        let mut mesh = Self { values: HashMap::new() };
+        let mut mesh = Self { values: Map::default() };
         mesh.evaluate(sampler, vertices)?;
         Ok(mesh)
     }
@@ -108,7 +129,7 @@ impl Mesh {
         while let Some(triangle) = open.pop() {
             let m = middle(triangle);
             let [apex, a, b] = triangle;
-            if self.values.contains_key(&m) {
+            if divides(triangle) && self.values.contains_key(&m) {
                 open.push([m, b, apex]);
                 open.push([m, apex, a]);
             } else {
@@ -117,12 +138,12 @@ impl Mesh {
         }
     }
 
-    /// Halves triangles of the mesh, and what must be halved with them to stay conforming.
+    /// Halves triangles of the mesh (which must [divide](divides)), and what must be halved with them to stay conforming.
     ///
     /// # Errors
     /// When the token is raised.
     pub fn halve(&mut self, sampler: &Sampler<'_>, triangles: &[Triangle]) -> Result<(), Canceled> {
-        let (mut wanted, mut new) = (Vec::new(), HashMap::new());
+        let (mut wanted, mut new) = (Vec::new(), Map::default());
         for &triangle in triangles {
             wanted.push(middle(triangle));
             while let Some(v) = wanted.pop() {

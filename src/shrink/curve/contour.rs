@@ -6,14 +6,13 @@
 //! the values around them: beside a slot, a strut or a tip that slipped between the vertices the field is nearer to zero
 //! than to any loop, and where a rounding is not resolved the normals of successive crossings are far apart.
 
-use super::bisection::{Mesh, Triangle, Vertex, divides, place, size};
+use super::bisection::{Map, Mesh, Triangle, Vertex, divides, place, size};
 use super::corners::{Corner, Step, with_corners};
 use super::polyline::{Segments, double_area};
 use super::{Detail, ShrinkError};
 use crate::field::{Metric, Sampler};
 use crate::settings::Canceled;
 use glam::{DVec2, DVec3};
-use std::collections::{HashMap, HashSet};
 
 /// Cells per side of the first mesh where the field says how fast it can vary, and where it does not.
 const COARSE: (u32, u32) = (32, 64);
@@ -25,6 +24,8 @@ const SHORT: f64 = 2.0;
 const SLACK: f64 = 0.1;
 /// Successive normals that turn by more than 20 degrees ask for a closer look, unless a corner is between them.
 const TURN_COSINE: f64 = 0.94;
+/// A loop whose successive normals turn by more than 90 degrees, with no corner between them, has turned back.
+const BACK_COSINE: f64 = 0.0;
 /// Vertices of a mesh at most.
 const MOST: usize = 500_000;
 /// Rounds of root finding on the edges; a bracket shrinks at least eightfold in three of them.
@@ -93,19 +94,19 @@ pub(super) fn contour(sampler: &Sampler<'_>, detail: Detail) -> Result<Vec<Loop>
 /// What was found on edges, and between them, that are still there after the mesh was halved elsewhere.
 #[derive(Default)]
 pub(super) struct Known {
-    crossings: HashMap<Edge, Crossing>,
-    pub corners: HashMap<(Edge, Edge), Option<Corner>>,
+    crossings: Map<Edge, Crossing>,
+    pub corners: Map<(Edge, Edge), Option<Corner>>,
 }
 
 /// How fast the field varies around every vertex, at most.
 struct Near {
-    slopes: HashMap<Vertex, f64>,
+    slopes: Map<Vertex, f64>,
     bound: Option<f64>,
 }
 
 impl Near {
     fn new(mesh: &Mesh, bound: Option<f64>, exact: bool) -> Self {
-        let mut slopes = HashMap::with_capacity(mesh.len());
+        let mut slopes = Map::default();
         // a distance needs no estimate
         if !exact {
             mesh.triangles(|t| {
@@ -155,7 +156,7 @@ fn unaccounted(
     let polygons: Vec<&[DVec2]> = loops.iter().map(|(l, _)| l.points.as_slice()).collect();
     let segments = Segments::new(&polygons, detail.coarsest);
     let fine = |t: Triangle| size(t) > detail.finest && divides(t);
-    let mut wanted: HashSet<Triangle> = HashSet::new();
+    let mut wanted: Vec<Triangle> = Vec::new();
     mesh.triangles(|t| {
         if !fine(t) || !near.may_hold(mesh, t) {
             return;
@@ -166,20 +167,57 @@ fn unaccounted(
             value <= reach * near.slope(v) && !segments.any_within(place(v), says + SLACK * size(t))
         });
         if odd {
-            wanted.insert(t);
+            wanted.push(t);
         }
     });
+    // a loop that turns back at once ends where its triangles do, or a real tip
+    let mut ends = Ends { cells: Map::default(), reach: detail.coarsest };
     for (l, triangles) in loops {
         let n = l.points.len();
         for k in 0..n {
-            if l.normals[k][1].dot(l.normals[(k + 1) % n][0]) < TURN_COSINE && fine(triangles[k]) {
-                wanted.insert(triangles[k]);
+            let turn = l.normals[k][1].dot(l.normals[(k + 1) % n][0]);
+            if turn < TURN_COSINE && fine(triangles[k]) {
+                wanted.push(triangles[k]);
+            }
+            if turn < BACK_COSINE {
+                ends.add(l.points[k], size(triangles[k]));
             }
         }
     }
-    let mut wanted: Vec<Triangle> = wanted.into_iter().collect();
+    if !ends.cells.is_empty() {
+        mesh.triangles(|t| {
+            if fine(t) && near.may_hold(mesh, t) && ends.is_coarse(t) {
+                wanted.push(t);
+            }
+        });
+    }
     wanted.sort_unstable();
+    wanted.dedup();
     wanted
+}
+
+/// Where loops turn back, and how fine the mesh is there. Around them it has to be about as fine: what goes on from there goes on
+/// through triangles whose corners the two ends account for.
+struct Ends {
+    cells: Map<(u32, u32), Vec<(DVec2, f64)>>,
+    reach: f64,
+}
+
+impl Ends {
+    fn cell(&self, p: DVec2) -> (u32, u32) {
+        let c = ((p + 2.0) / self.reach).floor().as_uvec2();
+        (c.x, c.y)
+    }
+    fn add(&mut self, p: DVec2, size: f64) {
+        self.cells.entry(self.cell(p)).or_default().push((p, size));
+    }
+    fn is_coarse(&self, t: Triangle) -> bool {
+        let (p, size) = (place(t[0]), size(t));
+        let (x, y) = self.cell(p);
+        let of = |c: (u32, u32)| self.cells.get(&c).map(Vec::as_slice).unwrap_or_default();
+        let near = |&(q, fine): &(DVec2, f64)| size > 2.5 * fine && p.distance(q) <= self.reach;
+        (x - 1..=x + 1).any(|x| (y - 1..=y + 1).any(|y| of((x, y)).iter().any(near)))
+    }
 }
 
 /// An edge by its ends, the smaller first.
@@ -208,7 +246,7 @@ fn trace(sampler: &Sampler<'_>, mesh: &Mesh, known: &mut Known) -> Result<Vec<(L
 /// Loops of crossed edges, each with the triangle that the contour enters there.
 fn paths(mesh: &Mesh) -> Vec<Vec<(Edge, Triangle)>> {
     let edge = |a: Vertex, b: Vertex| (a.min(b), a.max(b));
-    let mut next: HashMap<Edge, (Edge, Triangle)> = HashMap::new();
+    let mut next: Map<Edge, (Edge, Triangle)> = Map::default();
     let mut starts: Vec<Edge> = Vec::new();
     mesh.triangles(|t| {
         // entering where the boundary of the triangle goes from inside to outside keeps the solid on the left
