@@ -10,8 +10,8 @@ pub mod serve;
 
 use crate::field::Domain;
 use crate::field::input::{DomainName, DomainOption};
-use crate::shrink::Method;
 use crate::shrink::lattice::LatticeSpec;
+use crate::shrink::{Component, Density, Distortion, Method, OnTopology};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -38,7 +38,8 @@ struct Cli {
 enum Command {
     /// Run the service
     Serve(ServeArgs),
-    /// Wrap one field: exits 0 when the result is closed, has Euler characteristic 2 and no flips
+    /// Wrap one field: exits 0 when the result passed every check (closed, Euler characteristic 2, one chart, no flips, no
+    /// self-intersections, nowhere farther than 1 % of the diagonal from the zero level set)
     Extract(ExtractArgs),
     /// Print the description of the service (OpenAPI 3.1, YAML)
     Openapi,
@@ -83,6 +84,24 @@ pub struct ExtractArgs {
     /// Samples of the curve that a 2-D scene gives [default: N_THETA of the lattice]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(8..=100_000))]
     pub samples: Option<u32>,
+    /// How the samples are spread over the surface
+    #[arg(long, value_enum, default_value_t = DensityArg::Curvature)]
+    pub density: DensityArg,
+    /// What the sphere map keeps best
+    #[arg(long, value_enum, default_value_t = DistortionArg::Isometric)]
+    pub distortion: DistortionArg,
+    /// What to do with a shape that has handles or several components
+    #[arg(long, value_enum, default_value_t = OnTopologyArg::Refuse)]
+    pub on_topology: OnTopologyArg,
+    /// Component to wrap where there are several: largest, or an index from 0, largest first
+    #[arg(long, value_name = "WHICH", value_parser = parse_component)]
+    pub component: Option<Component>,
+    /// Attempts at most, each with more effort, until one passes [default: 3]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=3))]
+    pub attempts: Option<u32>,
+    /// Field evaluations that a further attempt may not go beyond
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    pub max_evaluations: Option<u64>,
     /// Latent code of an auto-decoder: a JSON list of numbers
     #[arg(long, value_name = "FILE.json", conflicts_with = "latent_row")]
     pub latent: Option<PathBuf>,
@@ -124,6 +143,74 @@ impl From<MethodArg> for Method {
             MethodArg::Adaptive => Method::Adaptive,
             MethodArg::Paper => Method::Paper,
         }
+    }
+}
+
+/// How the samples are spread over the surface.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum DensityArg {
+    /// Evenly by area
+    Area,
+    /// More where the surface is curved
+    Curvature,
+    /// More where the solid or the space beside it is thin
+    Reach,
+}
+
+impl From<DensityArg> for Density {
+    fn from(density: DensityArg) -> Self {
+        match density {
+            DensityArg::Area => Density::Area,
+            DensityArg::Curvature => Density::Curvature,
+            DensityArg::Reach => Density::Reach,
+        }
+    }
+}
+
+/// What the sphere map keeps best.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum DistortionArg {
+    /// Areas, as far as the density allows
+    Area,
+    /// Angles
+    Angle,
+    /// Both: lengths
+    Isometric,
+}
+
+impl From<DistortionArg> for Distortion {
+    fn from(distortion: DistortionArg) -> Self {
+        match distortion {
+            DistortionArg::Area => Distortion::Area,
+            DistortionArg::Angle => Distortion::Angle,
+            DistortionArg::Isometric => Distortion::Isometric,
+        }
+    }
+}
+
+/// What to do with a shape that is no sphere.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum OnTopologyArg {
+    /// Say how many components or handles there are and where
+    Refuse,
+    /// Wrap it all the same and say how much area had to be invented
+    Wrap,
+}
+
+impl From<OnTopologyArg> for OnTopology {
+    fn from(on_topology: OnTopologyArg) -> Self {
+        match on_topology {
+            OnTopologyArg::Refuse => OnTopology::Refuse,
+            OnTopologyArg::Wrap => OnTopology::Wrap,
+        }
+    }
+}
+
+/// `largest` or an index.
+fn parse_component(text: &str) -> Result<Component, String> {
+    match text {
+        "largest" => Ok(Component::Largest),
+        index => index.parse().map(Component::Index).map_err(|_| "expected largest or an index from 0".to_owned()),
     }
 }
 

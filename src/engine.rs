@@ -133,12 +133,26 @@ pub enum Outcome {
         /// The report.
         metrics: serde_json::Value,
     },
-    /// With a problem.
-    Failed(Failure),
+    /// With a problem, and with what was made all the same.
+    Failed {
+        /// The problem.
+        problem: Failure,
+        /// Outputs that did not pass, which are durable already.
+        outputs: Vec<Output>,
+        /// Their report.
+        metrics: Option<serde_json::Value>,
+    },
     /// It was stopped because it was asked to.
     Canceled,
     /// It was given back unfinished, because its worker is stopping; another worker will take it up.
     Released,
+}
+
+impl Outcome {
+    /// With a problem and nothing else.
+    pub fn failed(problem: Failure) -> Self {
+        Self::Failed { problem, outputs: Vec::new(), metrics: None }
+    }
 }
 
 /// What an engine can fail with. The text is for the log, not for clients.

@@ -111,6 +111,8 @@ impl State {
 pub struct ProgressView {
     /// Name of the stage.
     pub stage: String,
+    /// Number of the attempt at the surface, from 1 (not of the worker's, which the job counts); 0 before the first.
+    pub attempt: u32,
     /// Iteration within the stage, from 0.
     pub iteration: u32,
     /// Iterations of the stage; 0 when it is not known.
@@ -140,6 +142,9 @@ pub struct Output {
     pub bytes: u64,
     /// SHA-256 of its bytes, lower-case hexadecimal; also its strong `ETag`.
     pub sha256: String,
+    /// Whether the surface in it passed every check of its verdict (in the report). One that did not is kept for looking at.
+    #[serde(default)]
+    pub certified: bool,
 }
 
 /// A job's record: what clients see.
@@ -172,11 +177,12 @@ pub struct Job {
     pub progress: Option<ProgressView>,
     /// Seconds the rest may take.
     pub eta_s: Option<f64>,
-    /// What was measured about the result, once it succeeded: the same object as the output `report`.
+    /// What was measured about the result: the same object as the output `report`. A job that failed with `not_certified`
+    /// has it too, about the best surface that was made.
     // kept as a value, so that records of another version can still be shown
     #[schema(value_type = Option<crate::measure::AnyReport>)]
     pub metrics: Option<serde_json::Value>,
-    /// What it made, once it succeeded.
+    /// What it made. A job that failed because no surface passed keeps the best one, marked as not certified.
     pub outputs: Vec<Output>,
     /// Why it failed.
     pub problem: Option<Failure>,

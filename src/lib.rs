@@ -5,6 +5,7 @@ pub mod blobs;
 pub mod cli;
 pub mod config;
 pub mod engine;
+pub mod extract;
 pub mod field;
 pub mod http;
 pub mod job;

@@ -16,9 +16,11 @@ pub mod nearest;
 pub mod predicates;
 pub mod report;
 pub mod sampling;
+pub mod verdict;
 pub mod zero_set;
 
 pub use report::Report;
+pub use verdict::Verdict;
 
 use crate::settings::{Canceled, Settings};
 use glam::DVec3;

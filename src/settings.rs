@@ -48,6 +48,8 @@ pub struct Front {
 pub struct Progress {
     /// Name of the stage, one of the method's stage names (`contract`, `remesh`, `map`, `resample`, `untangle`, …).
     pub stage: &'static str,
+    /// Number of the attempt at the surface, from 1; 0 where attempts are not told apart.
+    pub attempt: u32,
     /// Iteration within the stage, from 0.
     pub iteration: u32,
     /// Iterations the stage will have, when it is known; otherwise 0.

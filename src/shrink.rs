@@ -14,11 +14,13 @@ mod energy;
 mod grid3;
 pub mod lattice;
 mod locate;
+pub mod mend;
 mod paper;
 mod remesh;
 mod resample;
 mod rings;
 mod sphere_map;
+pub mod study;
 mod topology;
 mod unfold;
 mod untangle;
@@ -55,6 +57,8 @@ pub struct ShrinkSpec {
     /// What to do with a shape that is no sphere.
     pub on_topology: OnTopology,
     /// Which component to wrap where there are several; without it several are refused.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<SpelledComponent>)]
     pub component: Option<Component>,
     /// Samples of the curve that a 2-D field gives; without it, as many as the lattice has columns. A 3-D field has none.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -87,6 +91,8 @@ pub enum Density {
 /// What the sphere map keeps best.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
+// the report's figures of distortion have the plain name
+#[schema(as = DistortionKept)]
 pub enum Distortion {
     /// Areas, as far as the density allows.
     Area,
@@ -108,14 +114,51 @@ pub enum OnTopology {
     Wrap,
 }
 
-/// One component of several.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
-#[serde(rename_all = "snake_case")]
+/// One component of several; in JSON `"largest"` or its index.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(from = "SpelledComponent", into = "SpelledComponent")]
 pub enum Component {
     /// The one of the largest volume.
     Largest,
     /// The one with this index, from 0, in the order of volume, largest first.
     Index(u32),
+}
+
+/// A [`Component`] as it is written.
+#[derive(Clone, Copy, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
+#[serde(untagged)]
+#[schema(as = Component)]
+enum SpelledComponent {
+    /// By its rank.
+    Name(ComponentName),
+    /// By its index, from 0, in the order of volume, largest first.
+    Index(u32),
+}
+
+/// A component by its rank.
+#[derive(Clone, Copy, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+enum ComponentName {
+    /// The one of the largest volume.
+    Largest,
+}
+
+impl From<SpelledComponent> for Component {
+    fn from(spelled: SpelledComponent) -> Self {
+        match spelled {
+            SpelledComponent::Name(ComponentName::Largest) => Component::Largest,
+            SpelledComponent::Index(index) => Component::Index(index),
+        }
+    }
+}
+
+impl From<Component> for SpelledComponent {
+    fn from(component: Component) -> Self {
+        match component {
+            Component::Largest => SpelledComponent::Name(ComponentName::Largest),
+            Component::Index(index) => SpelledComponent::Index(index),
+        }
+    }
 }
 
 /// How hard to try, and what is known from the attempts before.
@@ -169,6 +212,16 @@ pub enum ShrinkError {
         /// Scene positions, one inside each, largest first; at most 16.
         places: Vec<[f64; 3]>,
     },
+    /// The component that was asked for is not there.
+    #[error("there is no component {index}: {count} were found, counted from 0")]
+    NoComponent {
+        /// The index that was asked for.
+        index: u32,
+        /// How many were found.
+        count: usize,
+        /// Scene positions, one inside each, largest first; at most 16.
+        places: Vec<[f64; 3]>,
+    },
     /// The zero level set has handles.
     #[error("the zero level set has genus {genus} (handles; in the plane, holes), and only genus 0 can be wrapped")]
     Genus {
@@ -188,6 +241,30 @@ pub enum ShrinkError {
         /// The dimension that is needed.
         wanted: u8,
     },
+}
+
+impl ShrinkError {
+    /// Its stable name.
+    pub fn code(&self) -> &'static str {
+        match self {
+            ShrinkError::Canceled(_) => "canceled",
+            ShrinkError::Empty { .. } => "empty_zero_set",
+            ShrinkError::Components { .. } => "components",
+            ShrinkError::NoComponent { .. } => "no_such_component",
+            ShrinkError::Genus { .. } => "genus",
+            ShrinkError::Unmapped => "unmapped",
+            ShrinkError::Dimension { .. } => "dimension",
+        }
+    }
+    /// The scene positions that it names.
+    pub fn places(&self) -> Vec<DVec3> {
+        match self {
+            ShrinkError::Components { places, .. }
+            | ShrinkError::NoComponent { places, .. }
+            | ShrinkError::Genus { places, .. } => places.iter().map(|&p| DVec3::from(p)).collect(),
+            _ => Vec::new(),
+        }
+    }
 }
 
 /// Contracts a sphere onto the zero level set of the sampler's field.

@@ -1,10 +1,12 @@
 //! `shrinkd extract`: one field in, files out, and one line that says how good they are.
 
 use super::{BAD_INPUT, BAD_USAGE, ExtractArgs, FAILED, NOT_WRAPPED, fail};
+use crate::extract::Budget;
 use crate::field::input::FieldOptions;
 use crate::job::failure::Ended;
 use crate::job::pipeline::{self, CurveMade, Made};
 use crate::job::spec::{FieldSpec, OutputName};
+use crate::measure::verdict::Finding;
 use crate::settings::{CancelToken, Progress, Settings};
 use crate::shrink::ShrinkSpec;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -15,17 +17,19 @@ use std::time::Instant;
 /// Steps of the bar.
 const STEPS: u64 = 1000;
 
+/// Places that are printed of each fault.
+const PLACES: usize = 4;
+
 /// Wraps one field.
 pub fn run(args: &ExtractArgs) -> ExitCode {
     match extract(args) {
-        Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => fail(FAILED, &"the result did not pass its own checks (closed, Euler characteristic 2, no flips)"),
+        Ok(()) => ExitCode::SUCCESS,
         Err((code, error)) => fail(code, &error),
     }
 }
 
-/// Whether the result passed its checks; or an exit code and what to say.
-fn extract(args: &ExtractArgs) -> Result<bool, (u8, String)> {
+/// An exit code and what to say, where there is no result that passed its checks.
+fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
     let clock = Instant::now();
     let bytes = std::fs::read(&args.field).map_err(|e| (BAD_INPUT, format!("{}: {e}", args.field.display())))?;
     let options = FieldOptions {
@@ -45,15 +49,22 @@ fn extract(args: &ExtractArgs) -> Result<bool, (u8, String)> {
     let (cancel, bar) = (CancelToken::new(), progress_bar());
     let progress = |progress: Progress| {
         bar.set_position((f64::from(progress.fraction) * STEPS as f64) as u64);
-        bar.set_message(progress.stage);
+        bar.set_message(match progress.attempt {
+            0 | 1 => progress.stage.to_owned(),
+            n => format!("{} (attempt {n})", progress.stage),
+        });
     };
     let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress };
     let shrink = ShrinkSpec {
         method: args.method.into(),
         lattice: args.lattice,
+        density: args.density.into(),
+        distortion: args.distortion.into(),
+        on_topology: args.on_topology.into(),
+        component: args.component,
         samples: args.samples,
-        ..ShrinkSpec::default()
     };
+    let budget = Budget { attempts: args.attempts, evaluations: args.max_evaluations };
     let load = clock.elapsed().as_secs_f64();
     let ended = |ended: Ended| match ended {
         Ended::Failed(failure) if failure.is_bad_input() => (BAD_INPUT, in_field(&failure.detail)),
@@ -66,34 +77,56 @@ fn extract(args: &ExtractArgs) -> Result<bool, (u8, String)> {
         files.push((OutputName::Svg, svg.clone()));
         files.sort();
         let outputs: Vec<OutputName> = files.iter().map(|(output, _)| *output).collect();
-        let made = pipeline::make_curve(&opened, &shrink, &outputs, load, settings).map_err(ended)?;
+        let made = pipeline::make_curve(&opened, &shrink, budget, &outputs, load, settings).map_err(ended)?;
         bar.finish_and_clear();
         for ((_, path), (_, bytes)) in files.iter().zip(&made.files) {
             write(path, bytes)?;
         }
         println!("{}", curve_summary(args, &svg, &made, clock.elapsed().as_secs_f64()));
-        if made.is_sound() {
-            return Ok(true);
+        for warning in &made.report.verdict.warnings {
+            eprintln!("shrinkd: {}", in_field(&finding("warning: ", warning)));
         }
-        let at: Vec<String> = made.places.iter().take(4).map(|[x, y, _]| format!("({x:.4}, {y:.4})")).collect();
-        let at = if at.is_empty() { String::new() } else { format!(" at {}", at.join(", ")) };
-        return Err((
-            FAILED,
-            in_field(&format!("the curve was written, and it did not pass: {}{at}", made.faults.join("; "))),
-        ));
+        if made.is_sound() {
+            return Ok(());
+        }
+        let faults = made.report.verdict.faults.iter().map(|fault| format!("\n{}", finding("  ", fault)));
+        let faults: String = faults.collect();
+        return Err((FAILED, in_field(&format!("the best curve was written, and it did not pass:{faults}"))));
     }
     if args.samples.is_some() || args.svg.is_some() {
         return Err((BAD_USAGE, in_field("--samples and --svg are for fields of dimension 2")));
     }
     let files = wanted(args);
     let outputs: Vec<OutputName> = files.iter().map(|(output, _)| *output).collect();
-    let made = pipeline::make(&opened, &shrink, &outputs, load, settings).map_err(ended)?;
+    let made = pipeline::make(&opened, &shrink, budget, &outputs, load, settings).map_err(ended)?;
     bar.finish_and_clear();
     for ((_, path), (_, bytes)) in files.iter().zip(&made.files) {
         write(path, bytes)?;
     }
     println!("{}", summary(args, &made, clock.elapsed().as_secs_f64()));
-    Ok(made.is_sound())
+    let verdict = &made.report.verdict;
+    for warning in &verdict.warnings {
+        eprintln!("shrinkd: {}", in_field(&finding("warning: ", warning)));
+    }
+    if verdict.passed {
+        return Ok(());
+    }
+    let faults: String = verdict.faults.iter().map(|fault| format!("\n{}", finding("  ", fault))).collect();
+    let code = if made.refusal.is_some() { NOT_WRAPPED } else { FAILED };
+    let attempts = match made.report.attempts {
+        1 => "one attempt".to_owned(),
+        n => format!("{n} attempts"),
+    };
+    Err((code, in_field(&format!("the best surface of {attempts} was written, and it did not pass:{faults}"))))
+}
+
+/// A finding in one line: its sentence, its code, and where.
+fn finding(before: &str, finding: &Finding) -> String {
+    let places = finding.places.iter().take(PLACES).map(|[x, y, z]| format!("({x:.4}, {y:.4}, {z:.4})"));
+    let places: Vec<String> = places.collect();
+    let at = if places.is_empty() { String::new() } else { format!(" at {}", places.join(", ")) };
+    let more = if finding.places.len() > PLACES { " and more" } else { "" };
+    format!("{before}{} ({}){at}{more}", finding.detail, finding.code)
 }
 
 /// Which outputs go where, in the order of [`OutputName`].

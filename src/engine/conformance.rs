@@ -79,6 +79,7 @@ fn success(sha256: &str) -> Outcome {
         media_type: "model/gltf-binary".to_owned(),
         bytes: 1,
         sha256: sha256.to_owned(),
+        certified: true,
     };
     Outcome::Succeeded { outputs: vec![output], metrics: json!({"vertices": 1}) }
 }
@@ -124,7 +125,7 @@ async fn jobs_are_claimed_oldest_first_and_once(engine: &Arc<dyn Engine>) {
     assert_eq!(claimed, ids, "each job is claimed, and once");
     assert!(engine.claim("c", 3, Duration::ZERO).await.expect("claims").is_empty());
     for claim in claims {
-        engine.finish(&claim, Outcome::Failed(Failure::internal())).await.expect("finishes");
+        engine.finish(&claim, Outcome::failed(Failure::internal())).await.expect("finishes");
         let job = engine.get(claim.id).await.expect("reads").expect("is there");
         assert_eq!(job.problem.map(|p| p.code).as_deref(), Some("internal"));
     }

@@ -238,7 +238,9 @@ impl Engine for SqliteEngine {
                 Outcome::Succeeded { outputs, metrics } => {
                     Change { outputs: Some(outputs), metrics: Some(metrics), ..Change::to(State::Succeeded) }
                 }
-                Outcome::Failed(problem) => Change { problem: Some(problem), ..Change::to(State::Failed) },
+                Outcome::Failed { problem, outputs, metrics } => {
+                    Change { problem: Some(problem), outputs: Some(outputs), metrics, ..Change::to(State::Failed) }
+                }
                 Outcome::Canceled => Change::to(State::Canceled),
                 // a job that is given back while it was to be stopped has stopped
                 Outcome::Released if standing == Renewal::CancelRequested => Change::to(State::Canceled),

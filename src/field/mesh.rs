@@ -11,6 +11,7 @@ mod intersect;
 mod obj;
 mod off;
 mod ply;
+mod sheet;
 mod sides;
 mod stl;
 mod text;
@@ -19,6 +20,7 @@ mod tree;
 mod winding;
 
 pub use distance::MeshField;
+pub use sheet::Sheet;
 pub use topology::Soundness;
 
 use super::FieldError;

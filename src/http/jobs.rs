@@ -343,6 +343,9 @@ pub struct JobRequest {
     /// How it is shrunk.
     #[schema(required = false)]
     shrink: crate::shrink::ShrinkSpec,
+    /// What may be spent on it.
+    #[schema(required = false)]
+    budget: crate::extract::Budget,
     /// What is made; `glb`, `preview` and `report` when nothing is said, and `svg` of a 2-D field.
     #[schema(required = false)]
     outputs: Vec<crate::job::OutputName>,

@@ -1,11 +1,15 @@
 //! Why a job failed, as clients read it: an embedded problem object with a stable code.
 
 use crate::field::{Fault, FieldError};
+use crate::measure::Verdict;
 use crate::shrink::ShrinkError;
 use serde::{Deserialize, Serialize};
 
 /// Prefix of every problem type: `urn:shrinkd:problem:` and the code.
 pub const TYPE_PREFIX: &str = "urn:shrinkd:problem:";
+
+/// Places that a problem names, at most.
+const PLACES: usize = 32;
 
 /// One thing wrong in a request, at a place in it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -133,24 +137,35 @@ impl From<Box<Failure>> for Ended {
     }
 }
 
+impl Failure {
+    /// A shape that gave no surface, or turned out to be none that a sphere can wrap. Not for [`ShrinkError::Canceled`],
+    /// which is no failure.
+    pub fn from_shrink(error: &ShrinkError) -> Self {
+        let title = match error {
+            ShrinkError::Canceled(_) => "the job was canceled",
+            ShrinkError::Empty { .. } => "the field has no zero level set in its domain",
+            ShrinkError::Components { .. } => "the zero level set has several components",
+            ShrinkError::NoComponent { .. } => "there is no such component",
+            ShrinkError::Genus { .. } => "the zero level set has handles",
+            ShrinkError::Unmapped => "the surface could not be mapped to the sphere",
+            ShrinkError::Dimension { .. } => "the field has the wrong dimension for this",
+        };
+        let places = error.places().into_iter().map(|p| p.to_array()).collect();
+        Self { places, ..Self::new(error.code(), title, error.to_string()) }
+    }
+
+    /// A surface that did not pass its certificate; what is wrong with it is in the verdict.
+    pub fn not_certified(verdict: &Verdict) -> Self {
+        let places = verdict.places().into_iter().take(PLACES).map(|p| p.to_array()).collect();
+        Self { places, ..Self::new("not_certified", "no attempt gave a surface that passes", verdict.summary()) }
+    }
+}
+
 impl From<ShrinkError> for Ended {
     fn from(error: ShrinkError) -> Self {
-        let detail = error.to_string();
-        Ended::from(match error {
-            ShrinkError::Canceled(_) => return Ended::Canceled,
-            ShrinkError::Empty { .. } => {
-                Failure::new("empty_zero_set", "the field has no zero level set in its domain", detail)
-            }
-            ShrinkError::Components { places, .. } => {
-                Failure { places, ..Failure::new("components", "the zero level set has several components", detail) }
-            }
-            ShrinkError::Genus { places, .. } => {
-                Failure { places, ..Failure::new("genus", "the zero level set has handles", detail) }
-            }
-            ShrinkError::Unmapped => Failure::new("unmapped", "the surface could not be mapped to the sphere", detail),
-            ShrinkError::Dimension { .. } => {
-                Failure::new("dimension", "the field has the wrong dimension for this", detail)
-            }
-        })
+        match error {
+            ShrinkError::Canceled(_) => Ended::Canceled,
+            error => Ended::from(Failure::from_shrink(&error)),
+        }
     }
 }

@@ -7,20 +7,20 @@ pub use plane::{CurveMade, make_curve};
 use super::failure::{Ended, Failure};
 use super::spec::{FieldSpec, OutputName};
 use crate::blobs::BlobId;
+use crate::extract::{Budget, Extracted, Part, extract};
 use crate::field::input::{self, Description};
 use crate::field::sampler::Tally;
 use crate::field::scene::Scene;
 use crate::field::{Field, FieldError, Sampler};
-use crate::measure::{self, Report};
+use crate::measure::Report;
 use crate::settings::{Progress, Settings};
-use crate::shrink::{Effort, ShrinkSpec, shrink};
-use crate::surface::{self, Surface};
+use crate::shrink::{Method, ShrinkError, ShrinkSpec};
+use crate::surface;
 use serde::Serialize;
 use serde_json::{Value, json};
+use std::cell::Cell;
 use std::time::Instant;
 
-/// Share of a job's time that shrinking takes; measuring and writing take the rest.
-const SHRINK_SHARE: f32 = 0.75;
 /// Share of a job's time that is over when the outputs are written.
 const MEASURED_SHARE: f32 = 0.95;
 
@@ -41,13 +41,24 @@ pub struct Made {
     pub report: Report,
     /// The outputs that were asked for, in the order of [`OutputName`].
     pub files: Vec<(OutputName, Vec<u8>)>,
+    /// What the shape turned out to be after a surface was made, where that is none that a sphere can wrap.
+    pub refusal: Option<ShrinkError>,
 }
 
 impl Made {
-    /// Whether the result passed its own checks: closed, Euler characteristic 2, no flips of any kind.
+    /// Whether the result passed every check of its verdict.
     pub fn is_sound(&self) -> bool {
-        let flips = self.report.flips;
-        self.report.closed && self.report.euler == 2 && flips.surface + flips.sphere + flips.uv == 0
+        self.report.verdict.passed
+    }
+
+    /// Why this is no success, if it is none. The paper's loop is a baseline: what it makes is what was asked for, folds
+    /// and all, and only its verdict tells.
+    pub fn problem(&self) -> Option<Failure> {
+        match &self.refusal {
+            Some(error) => Some(Failure::from_shrink(error)),
+            None if self.is_sound() || self.report.method == Method::Paper => None,
+            None => Some(Failure::not_certified(&self.report.verdict)),
+        }
     }
 }
 
@@ -55,6 +66,8 @@ impl Made {
 pub struct Finished {
     /// The report.
     pub metrics: Value,
+    /// Whether it passed every check of its verdict.
+    pub certified: bool,
     /// The outputs that were asked for, in the order of [`OutputName`].
     pub files: Vec<(OutputName, Vec<u8>)>,
     /// Why this is no success, if it is none.
@@ -65,16 +78,19 @@ pub struct Finished {
 pub fn run(
     opened: &Opened,
     spec: &ShrinkSpec,
+    budget: Budget,
     outputs: &[OutputName],
     load_seconds: f64,
     settings: Settings<'_>,
 ) -> Result<Finished, Ended> {
     if opened.field.dimension() == 2 {
-        let made = make_curve(opened, spec, outputs, load_seconds, settings)?;
-        return Ok(Finished { metrics: json!(made.report), problem: made.problem(), files: made.files });
+        let made = make_curve(opened, spec, budget, outputs, load_seconds, settings)?;
+        let (certified, problem) = (made.is_sound(), made.problem());
+        return Ok(Finished { metrics: json!(made.report), certified, problem, files: made.files });
     }
-    let made = make(opened, spec, outputs, load_seconds, settings)?;
-    Ok(Finished { metrics: json!(made.report), files: made.files, problem: None })
+    let made = make(opened, spec, budget, outputs, load_seconds, settings)?;
+    let (certified, problem) = (made.is_sound(), made.problem());
+    Ok(Finished { metrics: json!(made.report), certified, problem, files: made.files })
 }
 
 /// Checks a scene that is written out in a request, and tells its dimension. Pointers are relative to the scene.
@@ -105,38 +121,54 @@ pub fn open(spec: &FieldSpec, bytes: Option<&[u8]>, at: &str) -> Result<Opened, 
     Ok(Opened { field, provenance })
 }
 
-/// Shrinks, measures and writes. `load_seconds` is what opening the field took.
+/// Seconds that the parts of an extraction took.
+#[derive(Default)]
+struct Clock {
+    shrink: Cell<f64>,
+    measure: Cell<f64>,
+    /// The part that runs, and since when.
+    running: Cell<Option<(Part, Instant)>>,
+}
+
+impl Clock {
+    fn begin(&self, next: Option<Part>) {
+        if let Some((part, since)) = self.running.take() {
+            let sum = match part {
+                Part::Shrink => &self.shrink,
+                Part::Measure => &self.measure,
+            };
+            sum.set(sum.get() + since.elapsed().as_secs_f64());
+        }
+        self.running.set(next.map(|part| (part, Instant::now())));
+    }
+}
+
+/// Makes a certified surface of the field, or the best there is, and writes it. `load_seconds` is what opening the field took.
 ///
 /// Every output but the report is the same for the same request, whatever the clock and the number of threads say.
 pub fn make(
     opened: &Opened,
     spec: &ShrinkSpec,
+    budget: Budget,
     outputs: &[OutputName],
     load_seconds: f64,
     settings: Settings<'_>,
 ) -> Result<Made, Ended> {
     let told = |progress: Progress| {
-        (settings.progress)(Progress { fraction: SHRINK_SHARE * progress.fraction, ..progress });
-    };
-    let stage = |stage: &'static str, fraction: f32| {
-        (settings.progress)(Progress { stage, fraction, ..Progress::default() });
+        (settings.progress)(Progress { fraction: MEASURED_SHARE * progress.fraction, ..progress });
     };
     let tally = Tally::new();
     let sampler = Sampler::new(opened.field.as_ref(), Settings { progress: &told, ..settings }, &tally);
-    let clock = Instant::now();
-    let wrap = shrink(&sampler, spec, &Effort::default())?;
-    let spent = tally.by_stage();
-    let shrink_seconds = clock.elapsed().as_secs_f64();
-
-    stage("measure", SHRINK_SHARE);
-    let clock = Instant::now();
-    let surface = Surface::new(wrap);
-    let mut report = measure::report::measure(&surface, &sampler, &spent, spec)?;
+    let clock = Clock::default();
+    let made = extract(&sampler, spec, budget, &|part| clock.begin(Some(part)));
+    clock.begin(None);
+    let Extracted { surface, mut report, refusal } = made?;
     report.seconds.load = load_seconds;
-    report.seconds.shrink = shrink_seconds;
-    report.seconds.finish = clock.elapsed().as_secs_f64();
+    report.seconds.shrink = clock.shrink.get();
+    report.seconds.finish = clock.measure.get();
 
-    stage("write", MEASURED_SHARE);
+    let write = Progress { stage: "write", attempt: report.attempts, ..Progress::default() };
+    (settings.progress)(Progress { fraction: MEASURED_SHARE, ..write });
     let clock = Instant::now();
     let lasting = lasting(&report);
     let mut files = Vec::new();
@@ -157,7 +189,7 @@ pub fn make(
         };
         files.push((output, bytes));
     }
-    Ok(Made { report, files })
+    Ok(Made { report, files, refusal })
 }
 
 /// The report without what another run would say differently.

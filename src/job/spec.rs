@@ -4,11 +4,12 @@
 //! with a JSON Pointer; unknown members are refused by name. The scene itself is checked by its own room.
 
 use crate::blobs::BlobId;
+use crate::extract::Budget;
 use crate::field::input::FieldOptions;
 use crate::field::{Fault, FieldError};
 use crate::shrink::curve::{MAX_SAMPLES, MIN_SAMPLES};
 use crate::shrink::lattice::LatticeSpec;
-use crate::shrink::{Method, ShrinkSpec};
+use crate::shrink::{Component, Density, Distortion, Effort, Method, OnTopology, ShrinkSpec};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use std::collections::BTreeMap;
@@ -115,6 +116,8 @@ pub struct JobSpec {
     pub field: FieldSpec,
     /// How it is shrunk.
     pub shrink: ShrinkSpec,
+    /// What may be spent on it.
+    pub budget: Budget,
     /// What is made; `glb`, `preview` and `report` when nothing is said, and `svg` of a 2-D field.
     pub outputs: Vec<OutputName>,
     /// Names the client gives the job; jobs can be listed by them.
@@ -238,10 +241,12 @@ fn read_spec(value: &Value, faults: &mut Faults) -> JobSpec {
         kind: super::JobKind::Shrink,
         field: FieldSpec::default(),
         shrink: ShrinkSpec::default(),
+        budget: Budget::default(),
         outputs: vec![OutputName::Glb, OutputName::Preview, OutputName::Report],
         labels: BTreeMap::new(),
     };
-    let Some(object) = faults.object(value, "", &["kind", "field", "shrink", "outputs", "labels"]) else { return spec };
+    let known = ["kind", "field", "shrink", "budget", "outputs", "labels"];
+    let Some(object) = faults.object(value, "", &known) else { return spec };
     if let Some(kind) = object.get("kind").and_then(|kind| faults.string(kind, "/kind"))
         && kind != "shrink"
     {
@@ -253,6 +258,9 @@ fn read_spec(value: &Value, faults: &mut Faults) -> JobSpec {
     }
     if let Some(shrink) = object.get("shrink") {
         spec.shrink = read_shrink(shrink, faults);
+    }
+    if let Some(budget) = object.get("budget") {
+        spec.budget = read_budget(budget, faults);
     }
     if let Some(outputs) = object.get("outputs") {
         spec.outputs = read_outputs(outputs, faults);
@@ -330,17 +338,18 @@ fn read_latent(value: &Value, faults: &mut Faults) -> Option<Vec<f32>> {
 
 fn read_shrink(value: &Value, faults: &mut Faults) -> ShrinkSpec {
     let mut shrink = ShrinkSpec::default();
-    let Some(object) = faults.object(value, "/shrink", &["method", "lattice", "samples"]) else { return shrink };
-    if let Some(method) = object.get("method").and_then(|m| faults.string(m, "/shrink/method")) {
-        match method {
-            "adaptive" => shrink.method = Method::Adaptive,
-            "paper" => shrink.method = Method::Paper,
-            other => {
-                let detail = format!("unknown method {other:?}; known: adaptive, paper");
-                faults.add("/shrink/method", "unknown_value", detail);
-            }
-        }
-    }
+    let known = ["method", "lattice", "density", "distortion", "on_topology", "component", "samples"];
+    let Some(object) = faults.object(value, "/shrink", &known) else { return shrink };
+    use {Density as D, Distortion as K, Method as M, OnTopology as T};
+    let methods = [("adaptive", M::Adaptive), ("paper", M::Paper)];
+    let densities = [("area", D::Area), ("curvature", D::Curvature), ("reach", D::Reach)];
+    let distortions = [("area", K::Area), ("angle", K::Angle), ("isometric", K::Isometric)];
+    let topologies = [("refuse", T::Refuse), ("wrap", T::Wrap)];
+    choose(object, "method", &methods, &mut shrink.method, faults);
+    choose(object, "density", &densities, &mut shrink.density, faults);
+    choose(object, "distortion", &distortions, &mut shrink.distortion, faults);
+    choose(object, "on_topology", &topologies, &mut shrink.on_topology, faults);
+    shrink.component = object.get("component").and_then(|component| read_component(component, faults));
     if let Some(lattice) = object.get("lattice").and_then(|lattice| read_lattice(lattice, faults)) {
         faults.0.extend(check_lattice(lattice, "/shrink/lattice"));
         shrink.lattice = lattice;
@@ -353,6 +362,67 @@ fn read_shrink(value: &Value, faults: &mut Faults) -> ShrinkSpec {
         }
     }
     shrink
+}
+
+/// A member of `shrink` that is one of a few names.
+fn choose<T: Copy>(
+    object: &Map<String, Value>,
+    member: &str,
+    known: &[(&str, T)],
+    chosen: &mut T,
+    faults: &mut Faults,
+) {
+    let pointer = format!("/shrink/{member}");
+    let Some(name) = object.get(member).and_then(|value| faults.string(value, &pointer)) else { return };
+    match known.iter().find(|(known, _)| *known == name) {
+        Some((_, value)) => *chosen = *value,
+        None => {
+            let names: Vec<&str> = known.iter().map(|(name, _)| *name).collect();
+            let detail = format!("unknown {member} {name:?}; known: {}", names.join(", "));
+            faults.add(pointer, "unknown_value", detail);
+        }
+    }
+}
+
+fn read_component(value: &Value, faults: &mut Faults) -> Option<Component> {
+    const POINTER: &str = "/shrink/component";
+    match value {
+        Value::String(name) if name == "largest" => Some(Component::Largest),
+        Value::String(name) => {
+            let detail = format!("unknown component {name:?}; give \"largest\" or an index from 0");
+            faults.add(POINTER, "unknown_value", detail);
+            None
+        }
+        Value::Number(_) => faults.count(value, POINTER).map(Component::Index),
+        other => {
+            let detail = format!("expected \"largest\" or an index, found {}", type_name(other));
+            faults.add(POINTER, "wrong_type", detail);
+            None
+        }
+    }
+}
+
+fn read_budget(value: &Value, faults: &mut Faults) -> Budget {
+    let mut budget = Budget::default();
+    let Some(object) = faults.object(value, "/budget", &["attempts", "evaluations"]) else { return budget };
+    if let Some(attempts) = object.get("attempts").and_then(|n| faults.count(n, "/budget/attempts")) {
+        if (1..=Effort::ATTEMPTS).contains(&attempts) {
+            budget.attempts = Some(attempts);
+        } else {
+            let detail = format!("{attempts} is not in 1 to {}", Effort::ATTEMPTS);
+            faults.add("/budget/attempts", "out_of_range", detail);
+        }
+    }
+    match object.get("evaluations").map(|n| (n, n.as_u64())) {
+        None => {}
+        Some((_, Some(0))) => faults.add("/budget/evaluations", "out_of_range", "0 evaluations make no surface"),
+        Some((_, Some(evaluations))) => budget.evaluations = Some(evaluations),
+        Some((n, None)) => {
+            let found = if n.is_number() { n.to_string() } else { type_name(n).to_owned() };
+            faults.add("/budget/evaluations", "wrong_type", format!("expected a whole number, found {found}"));
+        }
+    }
+    budget
 }
 
 fn read_lattice(value: &Value, faults: &mut Faults) -> Option<LatticeSpec> {
@@ -479,12 +549,48 @@ mod tests {
         let value = json!({
             "field": {"input": format!("sha256:{}", "ab".repeat(32)), "latent": [0.5, -1.0], "level": 0.25,
                       "domain": {"min": [-1, -1, -1], "max": [1, 1, 2]}},
-            "shrink": {"method": "paper", "lattice": {"octahedral": {"n": 9}}},
+            "shrink": {"method": "paper", "lattice": {"octahedral": {"n": 9}}, "density": "reach", "distortion": "angle",
+                       "on_topology": "wrap", "component": 2},
+            "budget": {"attempts": 2, "evaluations": 5_000_000_000u64},
             "outputs": ["report", "glb"], "labels": {"project": "demo"},
         });
         let spec = JobSpec::from_value(&value).expect("good");
         let stored = serde_json::to_value(&spec).expect("serializes");
+        assert_eq!(stored["shrink"]["component"], 2);
         assert_eq!(JobSpec::from_value(&stored), Ok(spec));
+        let largest = json!({"field": {"scene": {}}, "shrink": {"component": "largest"}});
+        let spec = JobSpec::from_value(&largest).expect("good");
+        let stored = serde_json::to_value(&spec).expect("serializes");
+        assert_eq!(stored["shrink"]["component"], "largest");
+        let shrink = serde_json::from_value(stored["shrink"].clone()).expect("reads");
+        assert_eq!((spec.shrink, spec.budget), (shrink, Budget::default()), "the record's own reader agrees");
+    }
+
+    #[test]
+    fn options_and_budget_are_checked_member_by_member() {
+        let found = faults(json!({
+            "field": {"scene": {}},
+            "shrink": {"density": "even", "distortion": 3, "on_topology": "ignore", "component": -1, "smooth": true},
+            "budget": {"attempts": 4, "evaluations": 0, "seconds": 3},
+        }));
+        let expected = [
+            ("/shrink/smooth", "unknown_member"),
+            ("/shrink/density", "unknown_value"),
+            ("/shrink/distortion", "wrong_type"),
+            ("/shrink/on_topology", "unknown_value"),
+            ("/shrink/component", "wrong_type"),
+            ("/budget/seconds", "unknown_member"),
+            ("/budget/attempts", "out_of_range"),
+            ("/budget/evaluations", "out_of_range"),
+        ];
+        assert_eq!(found, expected.map(|(p, c)| (p.to_owned(), c)));
+        let odd = |component: Value| faults(json!({"field": {"scene": {}}, "shrink": {"component": component}}));
+        assert_eq!(odd(json!("smallest")), [("/shrink/component".to_owned(), "unknown_value")]);
+        assert_eq!(odd(json!([0])), [("/shrink/component".to_owned(), "wrong_type")]);
+        let odd = |budget: Value| faults(json!({"field": {"scene": {}}, "budget": budget}));
+        assert_eq!(odd(json!({"evaluations": 1.5})), [("/budget/evaluations".to_owned(), "wrong_type")]);
+        assert_eq!(odd(json!({"attempts": 0})), [("/budget/attempts".to_owned(), "out_of_range")]);
+        assert_eq!(odd(json!(3)), [("/budget".to_owned(), "wrong_type")]);
     }
 
     #[test]

@@ -144,7 +144,7 @@ impl Worker {
         let promise = self.blobs.promise().await;
         let outcome = match result {
             Ok(made) => self.store(&claim, made).await,
-            Err(Ended::Failed(failure)) => Outcome::Failed(*failure),
+            Err(Ended::Failed(failure)) => Outcome::failed(*failure),
             Err(Ended::Canceled) if returning => Outcome::Released,
             Err(Ended::Canceled) => Outcome::Canceled,
         };
@@ -193,7 +193,8 @@ impl Worker {
                 let progress = |progress: Progress| teller.tell(progress);
                 let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress };
                 let load = clock.elapsed().as_secs_f64();
-                pipeline::run(&opened, &claim.spec.shrink, &claim.spec.outputs, load, settings)
+                let spec = &claim.spec;
+                pipeline::run(&opened, &spec.shrink, spec.budget, &spec.outputs, load, settings)
             };
             tokio::task::spawn_blocking(compute).await.unwrap_or_else(|panic| {
                 tracing::error!(%panic, "the computation panicked");
@@ -204,6 +205,7 @@ impl Worker {
 
     /// Stores the outputs; they are durable before the outcome that names them is told.
     async fn store(&self, claim: &Claim, made: pipeline::Finished) -> Outcome {
+        let certified = made.certified;
         let mut outputs = Vec::new();
         for (name, bytes) in made.files {
             let size = bytes.len() as u64;
@@ -214,16 +216,18 @@ impl Worker {
                     media_type: name.media_type().to_owned(),
                     bytes: size,
                     sha256: id.hex(),
+                    certified,
                 }),
                 Err(error) => {
                     tracing::error!(%error, output = name.name(), "an output could not be stored");
-                    return Outcome::Failed(Failure::internal());
+                    return Outcome::failed(Failure::internal());
                 }
             }
         }
+        let metrics = made.metrics;
         match made.problem {
-            None => Outcome::Succeeded { outputs, metrics: made.metrics },
-            Some(problem) => Outcome::Failed(problem),
+            None => Outcome::Succeeded { outputs, metrics },
+            Some(problem) => Outcome::Failed { problem, outputs, metrics: Some(metrics) },
         }
     }
 
@@ -233,7 +237,7 @@ impl Worker {
                 Ok(()) => {
                     let (ended, code) = match &outcome {
                         Outcome::Succeeded { .. } => ("succeeded", ""),
-                        Outcome::Failed(failure) => ("failed", failure.code.as_str()),
+                        Outcome::Failed { problem, .. } => ("failed", problem.code.as_str()),
                         Outcome::Canceled => ("canceled", ""),
                         Outcome::Released => ("released", ""),
                     };
@@ -266,7 +270,8 @@ struct Teller {
 
 #[derive(Default)]
 struct Last {
-    stage: &'static str,
+    /// Attempt and stage.
+    step: (u32, &'static str),
     progress: Option<Instant>,
     mesh: Option<Instant>,
 }
@@ -280,8 +285,9 @@ impl Teller {
         let now = Instant::now();
         let due = |last: Option<Instant>, every| last.is_none_or(|last: Instant| now.duration_since(last) >= every);
         let mut last = self.last.lock().unwrap_or_else(|e| e.into_inner());
-        if due(last.progress, PROGRESS_EVERY) || progress.stage != last.stage {
-            last.stage = progress.stage;
+        let step = (progress.attempt, progress.stage);
+        if due(last.progress, PROGRESS_EVERY) || step != last.step {
+            last.step = step;
             last.progress = Some(now);
             let view = view(&progress, self.started.elapsed());
             let data = serde_json::to_value(&view).unwrap_or_default();
@@ -304,6 +310,7 @@ fn view(progress: &Progress, elapsed: Duration) -> ProgressView {
     let done = f64::from(fraction);
     ProgressView {
         stage: progress.stage.to_owned(),
+        attempt: progress.attempt,
         iteration: progress.iteration,
         iterations: progress.iterations,
         fraction,

@@ -6,13 +6,14 @@ mod zeros;
 
 use super::nearest::Nearest;
 use super::report::{Distance, Evaluations, Flips, MAX_DISTANCE, OneWay, Seconds};
+use super::verdict::Verdict;
 use super::zero_set::trace;
 use super::{diagonal, map_chunks};
 use crate::field::sampler::Tally;
 use crate::field::{Counts, Metric, Sampler};
 use crate::settings::Canceled;
-use crate::shrink::Method;
 use crate::shrink::curve::{Curve, LeftOut};
+use crate::shrink::{Method, ShrinkSpec};
 use glam::{DVec2, DVec3};
 use polygon::{crossings, turning_number};
 use std::collections::{BTreeMap, BTreeSet};
@@ -73,8 +74,14 @@ pub struct CurveReport {
     pub threads: u64,
     /// How it was shrunk.
     pub method: Method,
+    /// Every option it was made with.
+    pub options: ShrinkSpec,
     /// Version of shrinkd.
     pub version: String,
+    /// Attempts that were made; `evaluations` and `seconds` are those of all of them.
+    pub attempts: u32,
+    /// Whether it succeeds, and if not, why.
+    pub verdict: Verdict,
 }
 
 /// The parameter against the length of the zero set between successive samples.
@@ -90,16 +97,6 @@ pub struct ArcLength {
     pub step_min: f64,
     /// Longest step between successive samples, in parts of the mean.
     pub step_max: f64,
-}
-
-/// A report, and where the curve is at fault.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Measured {
-    /// The figures.
-    pub report: CurveReport,
-    /// Scene positions of crossings, of edges that run the wrong way, and of the largest distance where it is too large;
-    /// at most 16 of each.
-    pub places: Vec<[f64; 3]>,
 }
 
 /// Where points land on the zero set, and the unit gradients there.
@@ -119,8 +116,8 @@ pub fn measure(
     curve: &Curve,
     sampler: &Sampler<'_>,
     spent: &BTreeMap<&'static str, Counts>,
-    method: Method,
-) -> Result<Measured, Canceled> {
+    spec: &ShrinkSpec,
+) -> Result<CurveReport, Canceled> {
     let own = Tally::new();
     let settings = *sampler.settings();
     let sampler = Sampler::new(sampler.field(), settings, &own);
@@ -160,7 +157,7 @@ pub fn measure(
         }
         for tallied in [&there, &back] {
             if tallied.max > MAX_DISTANCE * size {
-                worst.push(tallied.worst.to_array());
+                worst.push(tallied.worst);
             }
         }
         arc_length = along(&curve.parameters, &probes, &landed.ends, pieces);
@@ -168,11 +165,13 @@ pub fn measure(
     let (there, back) = if compared { (there.one_way(size), back.one_way(size)) } else { (FAR, FAR) };
     let mut crossed: Vec<usize> = crossing.iter().map(|pair| pair.0 as usize).collect();
     crossed.dedup();
-    let mut places: Vec<[f64; 3]> = crossed.into_iter().take(PLACES).map(|i| middle(i).to_array()).collect();
-    places.extend(backwards.iter().take(PLACES).map(|&i| middle(i).to_array()));
-    places.extend(worst);
+    let places = Places {
+        crossing: crossed.into_iter().take(PLACES).map(middle).collect(),
+        backwards: backwards.iter().take(PLACES).map(|&i| middle(i)).collect(),
+        far: worst,
+    };
     let falling = falling(&curve.parameters);
-    let report = CurveReport {
+    let mut report = CurveReport {
         dimension: 2,
         vertices: n as u64,
         edges: n as u64,
@@ -198,43 +197,47 @@ pub fn measure(
         left_out: curve.left_out,
         seconds: Seconds::default(),
         threads: settings.pool.current_num_threads() as u64,
-        method,
+        method: spec.method,
+        options: spec.clone(),
         version: env!("CARGO_PKG_VERSION").to_owned(),
+        attempts: 1,
+        verdict: Verdict::default(),
     };
-    Ok(Measured { report, places })
+    report.verdict = judge(&report, &places);
+    Ok(report)
 }
 
-/// Whether a curve succeeds: closed, simple, once around with the solid on its left, no edge the wrong way, nowhere farther than
+/// Where a curve is at fault.
+struct Places {
+    crossing: Vec<DVec3>,
+    backwards: Vec<DVec3>,
+    far: Vec<DVec3>,
+}
+
+/// Judges a curve: closed, simple, once around with the solid on its left, no edge the wrong way, nowhere farther than
 /// [`MAX_DISTANCE`] of the diagonal from the zero set, both ways, and its parameter arc length to [`MAX_DEVIATION`].
-///
-/// # Errors
-/// One sentence for every condition that does not hold.
-pub fn passes(report: &CurveReport) -> Result<(), Vec<String>> {
-    let mut faults = Vec::new();
-    let mut demand = |holds: bool, fault: String| {
+fn judge(report: &CurveReport, places: &Places) -> Verdict {
+    let mut verdict = Verdict { passed: true, ..Verdict::default() };
+    let mut demand = |holds: bool, code: &str, detail: String, places: &[DVec3]| {
         if !holds {
-            faults.push(fault);
+            verdict.fail(code, detail, places);
         }
     };
-    demand(report.closed, "the curve is not closed".to_owned());
+    demand(report.closed, "not_closed", "the curve is not closed".to_owned(), &[]);
     let turns = report.turning_number;
-    demand(turns == 1, format!("the curve turns around {turns} times instead of once"));
+    demand(turns == 1, "turning", format!("the curve turns around {turns} times instead of once"), &[]);
     let Flips { surface, uv, .. } = report.flips;
-    demand(surface == 0, format!("{surface} edges run against the zero set"));
-    demand(uv == 0, format!("the parameter falls at {uv} edges"));
+    demand(surface == 0, "folded", format!("{surface} edges run against the zero set"), &places.backwards);
+    demand(uv == 0, "chart_turned", format!("the parameter does not rise along {uv} edges"), &[]);
     let crossing = report.self_intersections;
-    demand(crossing == 0, format!("{crossing} pairs of edges intersect"));
-    let max = report.distance.max;
-    demand(
-        max <= MAX_DISTANCE,
-        format!("the largest distance is {:.3} % of the diagonal, over {} %", 100.0 * max, 100.0 * MAX_DISTANCE),
-    );
-    let deviation = report.arc_length.deviation_max;
-    demand(
-        deviation <= MAX_DEVIATION,
-        format!("the parameter is off arc length by {:.1} %, over {} %", 100.0 * deviation, 100.0 * MAX_DEVIATION),
-    );
-    if faults.is_empty() { Ok(()) } else { Err(faults) }
+    demand(crossing == 0, "self_intersections", format!("{crossing} pairs of edges intersect"), &places.crossing);
+    let (max, deviation) = (report.distance.max, report.arc_length.deviation_max);
+    let far = format!("the largest distance is {:.3} % of the diagonal, over {} %", 100.0 * max, 100.0 * MAX_DISTANCE);
+    demand(max <= MAX_DISTANCE, "distance", far, &places.far);
+    let off =
+        format!("the parameter is off arc length by {:.1} %, over {} %", 100.0 * deviation, 100.0 * MAX_DEVIATION);
+    demand(deviation <= MAX_DEVIATION, "arc_length", off, &[]);
+    verdict
 }
 
 /// Nothing to compare.

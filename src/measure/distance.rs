@@ -3,7 +3,7 @@
 
 use super::certificate::positions;
 use super::nearest::Nearest;
-use super::report::{Distance, OneWay};
+use super::report::{Distance, MAX_DISTANCE, OneWay};
 use super::sampling::{Samples, by_area};
 use super::{corners, diagonal, doubled_normal, zero_set};
 use crate::field::mesh::TriangleMesh;
@@ -21,6 +21,10 @@ const SEEDS: [u64; 2] = [1, 2];
 /// How far from the surface the field's zero set is looked for along the gradient, in parts of the diagonal. Beyond, the
 /// nearest point that the grid found counts.
 const REACH: f64 = 0.05;
+/// Places listed at most.
+const PLACES: usize = 16;
+/// Places closer than this are one, in parts of the diagonal: twice the bar, so that both sides of one miss are.
+const APART: f64 = 2.0 * MAX_DISTANCE;
 
 /// A mesh by reference: positions in scene units, and triangles.
 #[derive(Clone, Copy, Debug)]
@@ -32,7 +36,7 @@ pub struct Mesh<'a> {
 }
 
 /// Distances and normal consistency, both ways.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Comparison {
     /// Distances, in parts of the truth's diagonal.
     pub distance: Distance,
@@ -40,6 +44,9 @@ pub struct Comparison {
     pub normal_consistency: f64,
     /// The same with the sign: n . n'.
     pub normal_consistency_signed: f64,
+    /// Places of either side that are farther than [`MAX_DISTANCE`] from the other, scene units: the farthest first, and
+    /// of those close together one; at most 16.
+    pub far: Vec<DVec3>,
 }
 
 /// Distances and cosines of normals from samples of one side, weighted.
@@ -51,6 +58,8 @@ struct Tallied {
     max: f64,
     cosine: f64,
     cosine_absolute: f64,
+    /// Distance and place of what is farther than the bar.
+    far: Vec<(f64, DVec3)>,
 }
 
 impl Tallied {
@@ -61,6 +70,15 @@ impl Tallied {
         self.max = self.max.max(distance);
         self.cosine += weight * cosine;
         self.cosine_absolute += weight * cosine.abs();
+    }
+    /// Notes the places whose distance is over `bar`, and the largest distance of all.
+    fn extremes(&mut self, bar: f64, list: impl Iterator<Item = (f64, DVec3)>) {
+        for (distance, place) in list {
+            self.max = self.max.max(distance);
+            if distance > bar {
+                self.far.push((distance, place));
+            }
+        }
     }
     fn one_way(&self, diagonal: f64) -> OneWay {
         let n = self.weight.max(f64::MIN_POSITIVE);
@@ -74,9 +92,11 @@ impl Tallied {
     }
 }
 
-fn both(surface_to_truth: OneWay, truth_to_surface: OneWay) -> Comparison {
+fn both(there: Tallied, back: Tallied, size: f64) -> Comparison {
+    let (surface_to_truth, truth_to_surface) = (there.one_way(size), back.one_way(size));
     let (a, b) = (surface_to_truth, truth_to_surface);
     Comparison {
+        far: thinned([there.far, back.far].concat(), APART * size),
         distance: Distance {
             mean: 0.5 * (a.mean + b.mean),
             rms: (0.5 * (a.rms * a.rms + b.rms * b.rms)).sqrt(),
@@ -87,6 +107,21 @@ fn both(surface_to_truth: OneWay, truth_to_surface: OneWay) -> Comparison {
         normal_consistency: 0.5 * (a.normal_consistency + b.normal_consistency),
         normal_consistency_signed: 0.5 * (a.normal_consistency_signed + b.normal_consistency_signed),
     }
+}
+
+/// The farthest places, no two of them closer than `apart`.
+fn thinned(mut list: Vec<(f64, DVec3)>, apart: f64) -> Vec<DVec3> {
+    list.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let mut kept: Vec<DVec3> = Vec::new();
+    for (_, place) in list {
+        if kept.len() == PLACES {
+            break;
+        }
+        if kept.iter().all(|k| k.distance_squared(place) > apart * apart) {
+            kept.push(place);
+        }
+    }
+    kept
 }
 
 fn unit_normals(mesh: Mesh<'_>) -> Vec<DVec3> {
@@ -110,21 +145,29 @@ pub fn between(
         return Ok(None);
     }
     let size = diagonal(truth.vertices);
-    let there = one_way(surface, &on_surface, truth, settings)?.one_way(size);
-    let back = one_way(truth, &on_truth, surface, settings)?.one_way(size);
-    Ok(Some(both(there, back)))
+    let bar = MAX_DISTANCE * size;
+    let there = one_way(surface, &on_surface, truth, bar, settings)?;
+    let back = one_way(truth, &on_truth, surface, bar, settings)?;
+    Ok(Some(both(there, back, size)))
 }
 
-fn one_way(from: Mesh<'_>, samples: &Samples, to: Mesh<'_>, settings: &Settings<'_>) -> Result<Tallied, Canceled> {
+fn one_way(
+    from: Mesh<'_>,
+    samples: &Samples,
+    to: Mesh<'_>,
+    bar: f64,
+    settings: &Settings<'_>,
+) -> Result<Tallied, Canceled> {
     let nearest = Nearest::new(to.vertices, to.triangles);
     let (from_normals, to_normals) = (unit_normals(from), unit_normals(to));
     let mut tallied = Tallied::default();
-    for (hit, &t) in nearest.closest_all(&samples.points, settings)?.iter().zip(&samples.triangles) {
+    let hits = nearest.closest_all(&samples.points, settings)?;
+    for (hit, &t) in hits.iter().zip(&samples.triangles) {
         tallied.add(1.0, hit.distance(), from_normals[t as usize].dot(to_normals[hit.triangle as usize]));
     }
-    for hit in nearest.closest_all(from.vertices, settings)? {
-        tallied.max = tallied.max.max(hit.distance());
-    }
+    tallied.extremes(bar, hits.iter().map(|hit| hit.distance()).zip(samples.points.iter().copied()));
+    let hits = nearest.closest_all(from.vertices, settings)?;
+    tallied.extremes(bar, hits.iter().map(|hit| hit.distance()).zip(from.vertices.iter().copied()));
     Ok(tallied)
 }
 
@@ -153,17 +196,20 @@ pub fn to_field(surface: Mesh<'_>, samples: usize, sampler: &Sampler<'_>) -> Res
     let landed = land(&starts, &zeros, REACH * size, sampler)?;
     let mut there = Tallied::default();
     for (i, (distance, normal)) in landed.iter().enumerate() {
-        match on_surface.triangles.get(i) {
-            Some(&t) => there.add(1.0, *distance, normals[t as usize].dot(*normal)),
-            None => there.max = there.max.max(*distance),
+        if let Some(&t) = on_surface.triangles.get(i) {
+            there.add(1.0, *distance, normals[t as usize].dot(*normal));
         }
     }
+    let bar = MAX_DISTANCE * size;
+    there.extremes(bar, landed.iter().map(|(distance, _)| *distance).zip(starts.iter().copied()));
     let nearest = Nearest::new(surface.vertices, surface.triangles);
     let mut back = Tallied::default();
-    for (i, hit) in nearest.closest_all(&zeros.points, settings)?.iter().enumerate() {
+    let hits = nearest.closest_all(&zeros.points, settings)?;
+    for (i, hit) in hits.iter().enumerate() {
         back.add(zeros.weights[i], hit.distance(), normals[hit.triangle as usize].dot(zeros.normals[i]));
     }
-    Ok(Some(both(there.one_way(size), back.one_way(size))))
+    back.extremes(bar, hits.iter().map(|hit| hit.distance()).zip(zeros.points.iter().copied()));
+    Ok(Some(both(there, back, size)))
 }
 
 /// Distance from every start to the zero set, and the unit gradient where it lands.

@@ -28,7 +28,7 @@ const PROBE: f64 = 1.5;
 const SOLID: f64 = 0.45;
 /// Nodes that could not be given up and are farther outside than this many spacings are the membrane of a handle, the
 /// bridge to another component, or a void.
-const OBSTRUCTION: f64 = 1.8;
+pub(super) const OBSTRUCTION: f64 = 1.8;
 /// An obstruction that reaches farther outside than this many spacings is no matter of resolution.
 const CERTAIN: f64 = 6.0;
 
@@ -63,13 +63,18 @@ pub struct Resolution {
     pub probe: bool,
 }
 
-/// Contracts a sphere around the domain onto the zero level set.
-///
-/// # Errors
-/// A [`Refusal`] with [`ShrinkError::Empty`], [`ShrinkError::Components`], [`ShrinkError::Genus`] or
-/// [`ShrinkError::Canceled`].
-pub fn contract(scene: &Sampler<'_>, resolution: Resolution) -> Result<Front, Refusal> {
-    let settings = *scene.settings();
+/// What the contraction works on.
+pub(super) struct Lattice {
+    /// The lattice, in frame units, with values that change by about 1 per length.
+    pub grid: Grid3,
+    /// The frame that the lattice is in: about unit size, centred on the shape.
+    pub frame: Frame,
+    /// Change of the field's own value per length, by which values were divided.
+    pub slope: f64,
+}
+
+/// Evaluates the field on a lattice over the shape, near the zero level set.
+pub(super) fn lattice(scene: &Sampler<'_>, resolution: Resolution) -> Result<Lattice, Refusal> {
     let domain = scene.domain();
     let (mut lo, mut hi) = (DVec3::from(domain.min), DVec3::from(domain.max));
     let mut size = (hi - lo).max_element();
@@ -111,6 +116,17 @@ pub fn contract(scene: &Sampler<'_>, resolution: Resolution) -> Result<Front, Re
     for v in &mut grid.values {
         *v = (f64::from(*v) / (slope * frame.scale)) as f32;
     }
+    Ok(Lattice { grid, frame, slope })
+}
+
+/// Contracts a sphere around the domain onto the zero level set.
+///
+/// # Errors
+/// A [`Refusal`] with [`ShrinkError::Empty`], [`ShrinkError::Components`], [`ShrinkError::Genus`] or
+/// [`ShrinkError::Canceled`].
+pub fn contract(scene: &Sampler<'_>, resolution: Resolution) -> Result<Front, Refusal> {
+    let settings = *scene.settings();
+    let Lattice { grid, frame, .. } = lattice(scene, resolution)?;
     let sampler = scene.framed(frame);
     let thin = if resolution.probe { thin_walls(&sampler, &grid)? } else { Vec::new() };
     let mut target = grid.values.clone();
@@ -145,7 +161,7 @@ fn reach(grid: &Grid3, slope: f64, last: bool) -> f64 {
 
 /// Nodes just outside a wall thinner than the lattice can hold, with the place just under the wall's surface that stands
 /// for them. The lattice's own values rule out most nodes before the field is asked.
-fn thin_walls(sampler: &Sampler<'_>, grid: &Grid3) -> Result<Vec<(usize, DVec3)>, Canceled> {
+pub(super) fn thin_walls(sampler: &Sampler<'_>, grid: &Grid3) -> Result<Vec<(usize, DVec3)>, Canceled> {
     /// Interpolation across a cell can be this wrong, in spacings.
     const SLACK: f64 = 0.3;
     let h = grid.h;
@@ -210,7 +226,7 @@ fn simple_table() -> &'static [bool] {
 
 /// Gives up simple nodes with a positive value, farthest outside first, starting from the outermost layer. Returns which
 /// nodes stay inside.
-fn carve(grid: &Grid3, values: &[f32], cancel: &CancelToken) -> Result<Vec<bool>, Canceled> {
+pub(super) fn carve(grid: &Grid3, values: &[f32], cancel: &CancelToken) -> Result<Vec<bool>, Canceled> {
     /// Buckets that positive values are sorted into; within a bucket the order is that of arrival.
     const BUCKETS: usize = 4096;
     let simple = simple_table();

@@ -218,9 +218,10 @@ fn chosen(mut loops: Vec<Loop>, spec: &CurveSpec, frame: Frame) -> Result<(Loop,
         (Some(Component::Index(i)), all) => all.get(i as usize),
     };
     let Some(part) = part else {
-        return Err(ShrinkError::Components {
-            count: parts.len(),
-            places: places(&mut parts.iter().map(|p| p.outer), -1.0),
+        let (count, places) = (parts.len(), places(&mut parts.iter().map(|p| p.outer), -1.0));
+        return Err(match spec.component {
+            Some(Component::Index(index)) => ShrinkError::NoComponent { index, count, places },
+            _ => ShrinkError::Components { count, places },
         });
     };
     if !part.holes.is_empty() && spec.on_topology == OnTopology::Refuse {

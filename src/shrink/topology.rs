@@ -6,7 +6,7 @@ use crate::field::Frame;
 use glam::{DVec3, IVec3};
 
 /// Places named in an error, at most.
-const PLACES: usize = 16;
+pub(super) const PLACES: usize = 16;
 
 /// Names why nodes farther outside than `limit` had to stay inside: more than one component (or a void), or handles.
 /// `Ok` when neither is found.
@@ -19,15 +19,7 @@ pub fn explain(grid: &Grid3, values: &[f32], inside: &[bool], limit: f32, frame:
     let voids: Vec<Vec<usize>> =
         clusters(grid, &outside).into_iter().filter(|c| !c.iter().any(|&i| grid.on_border(i))).collect();
     bodies.sort_by_key(|c| std::cmp::Reverse(c.len()));
-    let place = |cluster: &Vec<usize>| {
-        let center = cluster.iter().map(|&i| grid.position(i)).sum::<DVec3>() / cluster.len() as f64;
-        let nearest = cluster
-            .iter()
-            .map(|&i| grid.position(i))
-            .min_by(|a, b| a.distance_squared(center).total_cmp(&b.distance_squared(center)))
-            .unwrap_or(center);
-        frame.to_scene(nearest).to_array()
-    };
+    let place = |cluster: &Vec<usize>| middle(grid, cluster, frame);
     if bodies.len() + voids.len() > 1 {
         let places = bodies.iter().chain(&voids).take(PLACES).map(place).collect();
         return Err(ShrinkError::Components { count: bodies.len() + voids.len(), places });
@@ -40,8 +32,19 @@ pub fn explain(grid: &Grid3, values: &[f32], inside: &[bool], limit: f32, frame:
     Ok(())
 }
 
+/// The node of a cluster that is nearest to its center, in scene units.
+pub(super) fn middle(grid: &Grid3, cluster: &[usize], frame: Frame) -> [f64; 3] {
+    let center = cluster.iter().map(|&i| grid.position(i)).sum::<DVec3>() / cluster.len().max(1) as f64;
+    let nearest = cluster
+        .iter()
+        .map(|&i| grid.position(i))
+        .min_by(|a, b| a.distance_squared(center).total_cmp(&b.distance_squared(center)))
+        .unwrap_or(center);
+    frame.to_scene(nearest).to_array()
+}
+
 /// Connected sets of nodes in the Freudenthal lattice.
-fn clusters(grid: &Grid3, set: &[bool]) -> Vec<Vec<usize>> {
+pub(super) fn clusters(grid: &Grid3, set: &[bool]) -> Vec<Vec<usize>> {
     let mut seen = vec![false; grid.len()];
     let mut list = Vec::new();
     for start in 0..grid.len() {
@@ -69,7 +72,7 @@ fn clusters(grid: &Grid3, set: &[bool]) -> Vec<Vec<usize>> {
     list
 }
 
-fn neighbour(grid: &Grid3, here: [usize; 3], offset: IVec3) -> Option<usize> {
+pub(super) fn neighbour(grid: &Grid3, here: [usize; 3], offset: IVec3) -> Option<usize> {
     let mut to = [0usize; 3];
     for k in 0..3 {
         to[k] = here[k].checked_add_signed(offset[k] as isize).filter(|&c| c < grid.nodes[k])?;
@@ -78,7 +81,7 @@ fn neighbour(grid: &Grid3, here: [usize; 3], offset: IVec3) -> Option<usize> {
 }
 
 /// Euler characteristic of the Freudenthal complex that a set of nodes spans.
-fn euler(grid: &Grid3, set: &[bool]) -> i64 {
+pub(super) fn euler(grid: &Grid3, set: &[bool]) -> i64 {
     // chains of the seven positive steps: an edge is one step, a triangle two nested ones, a tetrahedron three
     let steps = &NEIGHBOURS[..7];
     let nested = |a: IVec3, b: IVec3| a != b && (b - a).min_element() >= 0;

@@ -1,11 +1,12 @@
 //! Jobs of dimension 2: from a field to a certified curve and its outputs.
 
 use super::{MEASURED_SHARE, Opened, lasting, pretty};
+use crate::extract::Budget;
 use crate::field::Sampler;
 use crate::field::sampler::Tally;
 use crate::job::failure::{Ended, Failure};
 use crate::job::spec::OutputName;
-use crate::measure::curve::{CurveReport, Measured, measure, passes};
+use crate::measure::curve::{CurveReport, measure};
 use crate::measure::report::Evaluations;
 use crate::settings::{Progress, Settings};
 use crate::shrink::curve::{Curve, CurveSpec, shrink_curve};
@@ -24,16 +25,12 @@ pub struct CurveMade {
     pub report: CurveReport,
     /// The outputs that were asked for, in the order of [`OutputName`].
     pub files: Vec<(OutputName, Vec<u8>)>,
-    /// What does not hold, sentence by sentence, and where.
-    pub faults: Vec<String>,
-    /// Scene positions of the faults.
-    pub places: Vec<[f64; 3]>,
 }
 
 impl CurveMade {
-    /// Whether the curve passed every check of its certificate.
+    /// Whether the curve passed every check of its verdict.
     pub fn is_sound(&self) -> bool {
-        self.faults.is_empty()
+        self.report.verdict.passed
     }
 
     /// Why this is no success, if it is none. The paper's loop is a baseline: what it makes is what was asked for.
@@ -41,10 +38,9 @@ impl CurveMade {
         if self.is_sound() || self.report.method == Method::Paper {
             return None;
         }
-        let samples = self.report.vertices;
-        let detail = format!("{}; {samples} samples may be too few for this curve", self.faults.join("; "));
-        let failure = Failure::new("not_certified", "no attempt gave a surface that passes", detail);
-        Some(Failure { places: self.places.clone(), ..failure })
+        let failure = Failure::not_certified(&self.report.verdict);
+        let detail = format!("{}; {} samples may be too few for this curve", failure.detail, self.report.vertices);
+        Some(Failure { detail, ..failure })
     }
 }
 
@@ -58,28 +54,37 @@ fn rank(report: &CurveReport) -> (u64, f64) {
 pub fn make_curve(
     opened: &Opened,
     spec: &ShrinkSpec,
+    budget: Budget,
     outputs: &[OutputName],
     load_seconds: f64,
     settings: Settings<'_>,
 ) -> Result<CurveMade, Ended> {
     let tally = Tally::new();
-    let attempts = if spec.method == Method::Paper { 1 } else { Effort::ATTEMPTS };
-    let (mut best, mut refusal): (Option<(Curve, Measured)>, Option<ShrinkError>) = (None, None);
-    let (mut shrinking, mut measuring) = (0.0, 0.0);
-    for attempt in 0..attempts {
+    let spent = || tally.total().total();
+    let (mut best, mut refusal): (Option<(Curve, CurveReport)>, Option<ShrinkError>) = (None, None);
+    let (mut shrinking, mut measuring, mut costliest, mut attempts) = (0.0, 0.0, 0, 0);
+    for attempt in 0..budget.attempts(spec.method) {
+        let before = spent();
+        if attempt > 0 && !budget.allows(before, costliest) {
+            break;
+        }
+        attempts = attempt + 1;
         let (start, end) = (ENDS[attempt as usize], ENDS[attempt as usize + 1]);
         let told = |progress: Progress| {
             let fraction = MEASURED_SHARE * (start + (end - start) * progress.fraction);
-            (settings.progress)(Progress { fraction, ..progress });
+            (settings.progress)(Progress { fraction, attempt: attempt + 1, ..progress });
         };
         let sampler = Sampler::new(opened.field.as_ref(), Settings { progress: &told, ..settings }, &tally);
         let clock = Instant::now();
         let made = shrink_curve(&sampler, &CurveSpec::from(spec), &Effort { attempt, ..Effort::default() });
         shrinking += clock.elapsed().as_secs_f64();
+        costliest = costliest.max(spent() - before);
         let curve = match made {
             Ok(curve) => curve,
             // what is joined by something thin may look apart at first
-            Err(error @ (ShrinkError::Components { .. } | ShrinkError::Genus { .. })) => {
+            Err(
+                error @ (ShrinkError::Components { .. } | ShrinkError::NoComponent { .. } | ShrinkError::Genus { .. }),
+            ) => {
                 let again = refusal.as_ref().is_some_and(|before| before.to_string() == error.to_string());
                 refusal = Some(error);
                 if again {
@@ -91,25 +96,32 @@ pub fn make_curve(
         };
         let clock = Instant::now();
         told(Progress { stage: "measure", fraction: 0.8, ..Progress::default() });
-        let measured = measure(&curve, &sampler, &tally.by_stage(), spec.method)?;
+        let report = measure(&curve, &sampler, &tally.by_stage(), spec)?;
         measuring += clock.elapsed().as_secs_f64();
-        let passed = passes(&measured.report).is_ok();
-        if passed || best.as_ref().is_none_or(|(_, other)| rank(&measured.report) <= rank(&other.report)) {
-            best = Some((curve, measured));
+        let passed = report.verdict.passed;
+        if passed || best.as_ref().is_none_or(|(_, other)| rank(&report) <= rank(other)) {
+            best = Some((curve, report));
         }
         if passed {
             break;
         }
     }
-    let (curve, Measured { mut report, places }) = match (best, refusal) {
+    let (curve, mut report) = match (best, refusal) {
+        // a closer look that finds one loop is believed
         (Some(best), _) => best,
         (None, Some(refusal)) => return Err(refusal.into()),
         (None, None) => return Err(Failure::internal().into()),
     };
+    report.attempts = attempts;
     report.evaluations = Evaluations::new(&tally.by_stage(), report.vertices);
     (report.seconds.load, report.seconds.shrink, report.seconds.finish) = (load_seconds, shrinking, measuring);
 
-    (settings.progress)(Progress { stage: "write", fraction: MEASURED_SHARE, ..Progress::default() });
+    (settings.progress)(Progress {
+        stage: "write",
+        fraction: MEASURED_SHARE,
+        attempt: attempts,
+        ..Progress::default()
+    });
     let clock = Instant::now();
     let mut files = Vec::new();
     for &output in outputs {
@@ -126,6 +138,5 @@ pub fn make_curve(
         };
         files.push((output, bytes));
     }
-    let faults = passes(&report).err().unwrap_or_default();
-    Ok(CurveMade { report, files, faults, places })
+    Ok(CurveMade { report, files })
 }
