@@ -91,6 +91,9 @@ pub struct ExtractArgs {
     /// Where the sphere is sampled: latlong:N_THETAxN_PHI or octahedral:N
     #[arg(long, value_parser = parse_lattice, default_value = "latlong:200x100")]
     pub lattice: LatticeSpec,
+    /// Samples of the curve that a 2-D scene gives [default: N_THETA of the lattice]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(8..=100_000))]
+    pub samples: Option<u32>,
     /// How the samples are spread over the surface
     #[arg(long, value_enum, default_value_t = DensityArg::Curvature)]
     pub density: DensityArg,

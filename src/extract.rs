@@ -32,14 +32,15 @@ pub struct Budget {
 
 impl Budget {
     /// Attempts that a method may make: the paper's loop has no effort to add.
-    fn attempts(self, method: Method) -> u32 {
+    pub fn attempts(self, method: Method) -> u32 {
         match method {
             Method::Adaptive => self.attempts.unwrap_or(Effort::ATTEMPTS).clamp(1, Effort::ATTEMPTS),
             Method::Paper => 1,
         }
     }
 
-    fn allows(self, spent: u64, next: u64) -> bool {
+    /// Whether an attempt of cost `next` may follow what was `spent`.
+    pub fn allows(self, spent: u64, next: u64) -> bool {
         self.evaluations.is_none_or(|limit| spent.saturating_add(next) <= limit)
     }
 }

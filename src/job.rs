@@ -132,7 +132,7 @@ pub struct ProgressView {
 /// One finished output of a job.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Output {
-    /// Its name: `glb`, `surface`, `preview` or `report`.
+    /// Its name: `glb`, `surface`, `svg`, `preview` or `report`.
     pub name: String,
     /// Where it is downloaded.
     pub href: String,
@@ -180,7 +180,7 @@ pub struct Job {
     /// What was measured about the result: the same object as the output `report`. A job that failed with `not_certified`
     /// has it too, about the best surface that was made.
     // kept as a value, so that records of another version can still be shown
-    #[schema(value_type = Option<crate::measure::Report>)]
+    #[schema(value_type = Option<crate::measure::AnyReport>)]
     pub metrics: Option<serde_json::Value>,
     /// What it made. A job that failed because no surface passed keeps the best one, marked as not certified.
     pub outputs: Vec<Output>,

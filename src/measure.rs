@@ -9,6 +9,7 @@ pub mod bvh;
 pub mod certificate;
 pub mod chamfer;
 pub mod chart;
+pub mod curve;
 pub mod distance;
 pub mod distortion;
 pub mod evaluation;
@@ -28,6 +29,16 @@ pub use verdict::Verdict;
 use crate::settings::{Canceled, Settings};
 use glam::DVec3;
 use rayon::prelude::*;
+
+/// What is measured about a result: of a surface, or of the curve that a 2-D field gives.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, utoipa::ToSchema)]
+#[serde(untagged)]
+pub enum AnyReport {
+    /// Of a surface.
+    Surface(Box<Report>),
+    /// Of a curve: it has the member `dimension`.
+    Curve(Box<curve::CurveReport>),
+}
 
 /// Items per chunk of a parallel query: enough to pay for the scheduling, few enough that cancel is seen within a few
 /// milliseconds. Fixed, so that no result depends on the number of threads.

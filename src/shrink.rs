@@ -63,6 +63,19 @@ pub struct ShrinkSpec {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<SpelledComponent>)]
     pub component: Option<Component>,
+    /// Samples of the curve that a 2-D field gives; without it, as many as the lattice has columns. A 3-D field has none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub samples: Option<u32>,
+}
+
+impl ShrinkSpec {
+    /// Samples of the curve that a 2-D field gives: those asked for, or as many as a row of the lattice has at its equator.
+    pub fn curve_samples(&self) -> u32 {
+        self.samples.unwrap_or(match self.lattice {
+            LatticeSpec::Latlong { n_theta, .. } => n_theta,
+            LatticeSpec::Octahedral { n } => 4 * n,
+        })
+    }
 }
 
 /// How the samples are spread over the surface.
@@ -195,7 +208,7 @@ pub enum ShrinkError {
         max: f64,
     },
     /// The zero level set has several components.
-    #[error("the zero level set has {count} components, and a sphere can wrap one")]
+    #[error("the zero level set has {count} components, and one can be wrapped")]
     Components {
         /// How many were found.
         count: usize,
@@ -213,7 +226,7 @@ pub enum ShrinkError {
         places: Vec<[f64; 3]>,
     },
     /// The zero level set has handles.
-    #[error("the zero level set has genus {genus}, and a sphere can wrap only genus 0")]
+    #[error("the zero level set has genus {genus} (handles; in the plane, holes), and only genus 0 can be wrapped")]
     Genus {
         /// Number of handles.
         genus: usize,

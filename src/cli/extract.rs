@@ -1,6 +1,6 @@
 //! `shrinkd extract`: one field in, files out, and one line that says how good they are.
 
-use super::{BAD_INPUT, ExtractArgs, FAILED, NOT_WRAPPED, fail};
+use super::{BAD_INPUT, BAD_USAGE, ExtractArgs, FAILED, NOT_WRAPPED, fail};
 use crate::extract::Budget;
 use crate::field::input::FieldOptions;
 use crate::job::failure::Ended;
@@ -62,6 +62,7 @@ fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
         distortion: args.distortion.into(),
         on_topology: args.on_topology.into(),
         component: args.component,
+        samples: args.samples,
     };
     let budget = Budget { attempts: args.attempts, evaluations: args.max_evaluations };
     let load = clock.elapsed().as_secs_f64();
@@ -71,17 +72,29 @@ fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
         Ended::Canceled => (FAILED, "canceled".to_owned()),
     };
     if opened.field.dimension() == 2 {
-        let made = pipeline::make_curve(opened.field.as_ref(), &shrink, settings).map_err(ended)?;
-        bar.finish_and_clear();
         let svg = args.svg.clone().unwrap_or_else(|| args.output.with_extension("svg"));
-        write(&args.output, &made.glb)?;
-        write(&svg, &made.svg)?;
+        let mut files = wanted(args);
+        files.push((OutputName::Svg, svg.clone()));
+        files.sort();
+        let outputs: Vec<OutputName> = files.iter().map(|(output, _)| *output).collect();
+        let made = pipeline::make_curve(&opened, &shrink, budget, &outputs, load, settings).map_err(ended)?;
+        bar.finish_and_clear();
+        for ((_, path), (_, bytes)) in files.iter().zip(&made.files) {
+            write(path, bytes)?;
+        }
         println!("{}", curve_summary(args, &svg, &made, clock.elapsed().as_secs_f64()));
-        return if made.is_sound() {
-            Ok(())
-        } else {
-            Err((FAILED, in_field("the curve did not pass its own checks: closed, simple")))
-        };
+        for warning in &made.report.verdict.warnings {
+            eprintln!("shrinkd: {}", in_field(&finding("warning: ", warning)));
+        }
+        if made.is_sound() {
+            return Ok(());
+        }
+        let faults = made.report.verdict.faults.iter().map(|fault| format!("\n{}", finding("  ", fault)));
+        let faults: String = faults.collect();
+        return Err((FAILED, in_field(&format!("the best curve was written, and it did not pass:{faults}"))));
+    }
+    if args.samples.is_some() || args.svg.is_some() {
+        return Err((BAD_USAGE, in_field("--samples and --svg are for fields of dimension 2")));
     }
     let files = wanted(args);
     let outputs: Vec<OutputName> = files.iter().map(|(output, _)| *output).collect();
@@ -174,9 +187,9 @@ fn curve_summary(args: &ExtractArgs, svg: &Path, made: &CurveMade, seconds: f64)
         name(&args.field),
         name(&args.output),
         name(svg),
-        report.samples,
-        report.evaluations.total() as f64 / report.samples.max(1) as f64,
+        report.vertices,
+        report.evaluations.per_vertex,
         report.self_intersections,
-        100.0 * report.to_zero_set.max.max(report.from_zero_set.max),
+        100.0 * report.distance.max,
     )
 }

@@ -27,6 +27,16 @@ pub struct Input {
     description: Description,
 }
 
+impl Input {
+    /// 3 for surfaces, 2 for curves.
+    pub(super) fn dimension(&self) -> u8 {
+        match self.description {
+            Description::Scene { dimension, .. } => dimension,
+            _ => 3,
+        }
+    }
+}
+
 /// Uploads an input
 ///
 /// Raw bytes of a scene, a network, a mesh or a sampled grid. What it is is told by its content; a file that cannot be
@@ -89,7 +99,7 @@ pub async fn describe(
     Ok(Json(read_note(&note)?))
 }
 
-fn read_note(note: &[u8]) -> Result<Input, Problem> {
+pub(super) fn read_note(note: &[u8]) -> Result<Input, Problem> {
     serde_json::from_slice(note).map_err(|error| {
         tracing::error!(%error, "an input's note cannot be read");
         Problem::internal()

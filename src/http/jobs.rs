@@ -1,6 +1,6 @@
 //! `/v1/jobs`: submit, look, cancel, forget.
 
-use super::{App, Problem, body, conditional, query};
+use super::{App, Problem, body, conditional, inputs, query};
 use crate::blobs::BlobId;
 use crate::engine::{Forgotten, IdempotencyKey, NewJob, Submitted};
 use crate::field::{Fault, FieldError};
@@ -22,6 +22,10 @@ const MAX_RETRY_AFTER: f64 = 30.0;
 const ADAPTIVE_EVALUATIONS: f64 = 9.1;
 /// Evaluations per vertex of the paper's loop: a value with gradient in each of its 110 iterations and at the end.
 const PAPER_EVALUATIONS: f64 = 111.0;
+/// Evaluations that the contour of a planar shape takes, the median over `examples/scenes/2d`; a sample takes one more.
+const CONTOUR_EVALUATIONS: u64 = 10_000;
+/// Evaluations per sample of the paper's loop for curves: in each of its 100 iterations and at the end.
+const CURVE_PAPER_EVALUATIONS: u64 = 101;
 
 /// What a job may cost, judged before it runs.
 #[derive(Serialize, utoipa::ToSchema)]
@@ -75,9 +79,10 @@ pub async fn submit(
     // the keys of a JSON value are sorted, so that spaces and order do not make another request
     let fingerprint = BlobId::of(request.to_string().as_bytes()).hex();
     let spec = JobSpec::from_value(&request).map_err(|faults| Problem::invalid_request("", &faults))?;
-    let spec = check_field(&app, spec).await?;
+    let (spec, dimension) = check_field(&app, spec).await?;
+    let spec = spec.for_dimension(dimension, &request).map_err(|faults| Problem::invalid_request("", &faults))?;
     if validate_only {
-        return Ok(Json(estimate(&spec)).into_response());
+        return Ok(Json(estimate(&spec, dimension)).into_response());
     }
     if app.stop.is_cancelled() {
         return Err(Problem::unavailable("stopping", "the service is stopping"));
@@ -271,19 +276,20 @@ fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, Problem> {
     }
 }
 
-/// Checks what the field names: the scene in the request, or the input that must be there.
-async fn check_field(app: &App, spec: JobSpec) -> Result<JobSpec, Problem> {
+/// Checks what the field names: the scene in the request, or the input that must be there. Tells its dimension.
+async fn check_field(app: &App, spec: JobSpec) -> Result<(JobSpec, u8), Problem> {
     if let Some(id) = spec.field.input {
-        if app.blobs.note(id).await?.is_none() {
+        let Some(note) = app.blobs.note(id).await? else {
             let detail = format!("no input {id} is stored; upload it to /v1/inputs first");
             let fault = Fault { pointer: "/field/input".to_owned(), code: "unknown_input", detail };
             return Err(Problem::invalid_request("", &[fault]));
-        }
-        return Ok(spec);
+        };
+        let dimension = inputs::read_note(&note)?.dimension();
+        return Ok((spec, dimension));
     }
     // a scene may be large: checked off the runtime
     let (spec, checked) = tokio::task::spawn_blocking(move || {
-        let checked = spec.field.scene.as_ref().map_or(Ok(()), pipeline::check_scene);
+        let checked = spec.field.scene.as_ref().map_or(Ok(3), pipeline::check_scene);
         (spec, checked)
     })
     .await
@@ -292,13 +298,21 @@ async fn check_field(app: &App, spec: JobSpec) -> Result<JobSpec, Problem> {
         Problem::internal()
     })?;
     match checked {
-        Ok(()) => Ok(spec),
+        Ok(dimension) => Ok((spec, dimension)),
         Err(FieldError::Invalid { faults }) => Err(Problem::invalid_request("/field/scene", &faults)),
         Err(error) => Err(Failure::from_field(&error, "/field/scene").into()),
     }
 }
 
-fn estimate(spec: &JobSpec) -> Estimate {
+fn estimate(spec: &JobSpec, dimension: u8) -> Estimate {
+    if dimension == 2 {
+        let vertices = u64::from(spec.shrink.curve_samples());
+        let evaluations = match spec.shrink.method {
+            Method::Adaptive => CONTOUR_EVALUATIONS + vertices,
+            Method::Paper => CURVE_PAPER_EVALUATIONS * vertices,
+        };
+        return Estimate { valid: true, vertices, evaluations };
+    }
     let vertices = spec.shrink.lattice.vertices();
     let per_vertex = match spec.shrink.method {
         Method::Adaptive => ADAPTIVE_EVALUATIONS,
@@ -332,7 +346,7 @@ pub struct JobRequest {
     /// What may be spent on it.
     #[schema(required = false)]
     budget: crate::extract::Budget,
-    /// What is made; `glb`, `preview` and `report` when nothing is said.
+    /// What is made; `glb`, `preview` and `report` when nothing is said, and `svg` of a 2-D field.
     #[schema(required = false)]
     outputs: Vec<crate::job::OutputName>,
     /// Names to find the job by: at most 16.

@@ -22,7 +22,7 @@ const CACHE: &str = "private, max-age=86400, immutable";
     tag = "jobs",
     params(
         ("id" = String, Path, description = "the job"),
-        ("name" = String, Path, description = "`glb`, `surface`, `preview` or `report`"),
+        ("name" = String, Path, description = "`glb`, `surface`, `svg` (of a 2-D field), `preview` or `report`"),
         ("Range" = Option<String>, Header, description = "one range of bytes"),
         ("If-None-Match" = Option<String>, Header, description = "versions that are there already"),
         ("If-Range" = Option<String>, Header, description = "the range is of this version"),
@@ -33,7 +33,7 @@ const CACHE: &str = "private, max-age=86400, immutable";
             ("Repr-Digest", description = "the same as a digest (RFC 9530)"),
             ("Accept-Ranges", description = "`bytes`")),
             content((Vec<u8> = "model/gltf-binary"), (Vec<u8> = "application/octet-stream"), (Vec<u8> = "image/png"),
-                (crate::measure::Report = "application/json"))),
+                (String = "image/svg+xml"), (crate::measure::AnyReport = "application/json"))),
         (status = 206, description = "the range of it", headers(("Content-Range", description = "which bytes"))),
         (status = 304, description = "it is there already"),
         (status = 400, description = "a query parameter is unknown"),

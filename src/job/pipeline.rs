@@ -1,5 +1,9 @@
 //! From bytes to outputs: the one place where the job room meets the numeric rooms.
 
+mod plane;
+
+pub use plane::{CurveMade, make_curve};
+
 use super::failure::{Ended, Failure};
 use super::spec::{FieldSpec, OutputName};
 use crate::blobs::BlobId;
@@ -10,10 +14,9 @@ use crate::field::scene::Scene;
 use crate::field::{Field, FieldError, Sampler};
 use crate::measure::Report;
 use crate::settings::{Progress, Settings};
-use crate::shrink::curve::{CurveReport, CurveSpec, shrink_curve};
-use crate::shrink::lattice::LatticeSpec;
 use crate::shrink::{Method, ShrinkError, ShrinkSpec};
 use crate::surface;
+use serde::Serialize;
 use serde_json::{Value, json};
 use std::cell::Cell;
 use std::time::Instant;
@@ -59,9 +62,40 @@ impl Made {
     }
 }
 
-/// Checks a scene that is written out in a request. Pointers are relative to the scene.
-pub fn check_scene(scene: &Value) -> Result<(), FieldError> {
-    Scene::from_value(scene).map(|_| ())
+/// What a field made, of either dimension.
+pub struct Finished {
+    /// The report.
+    pub metrics: Value,
+    /// Whether it passed every check of its verdict.
+    pub certified: bool,
+    /// The outputs that were asked for, in the order of [`OutputName`].
+    pub files: Vec<(OutputName, Vec<u8>)>,
+    /// Why this is no success, if it is none.
+    pub problem: Option<Failure>,
+}
+
+/// Makes what a job asks for: a surface of a field of dimension 3, a curve of one of dimension 2.
+pub fn run(
+    opened: &Opened,
+    spec: &ShrinkSpec,
+    budget: Budget,
+    outputs: &[OutputName],
+    load_seconds: f64,
+    settings: Settings<'_>,
+) -> Result<Finished, Ended> {
+    if opened.field.dimension() == 2 {
+        let made = make_curve(opened, spec, budget, outputs, load_seconds, settings)?;
+        let (certified, problem) = (made.is_sound(), made.problem());
+        return Ok(Finished { metrics: json!(made.report), certified, problem, files: made.files });
+    }
+    let made = make(opened, spec, budget, outputs, load_seconds, settings)?;
+    let (certified, problem) = (made.is_sound(), made.problem());
+    Ok(Finished { metrics: json!(made.report), certified, problem, files: made.files })
+}
+
+/// Checks a scene that is written out in a request, and tells its dimension. Pointers are relative to the scene.
+pub fn check_scene(scene: &Value) -> Result<u8, FieldError> {
+    Scene::from_value(scene).map(|scene| scene.dimension())
 }
 
 /// Tells what bytes are, without running them.
@@ -143,6 +177,10 @@ pub fn make(
         let bytes = match output {
             OutputName::Glb => surface::gltf::to_glb(&surface, &lasting, &opened.provenance),
             OutputName::Surface => surface::tensors::to_safetensors(&surface),
+            OutputName::Svg => {
+                let detail = "svg is made of fields of dimension 2, and this one has dimension 3";
+                return Err(Failure::new("dimension", "the field has the wrong dimension for this", detail).into());
+            }
             OutputName::Preview => surface::preview::to_png(&surface, PREVIEW_WIDTH, &settings)?,
             OutputName::Report => {
                 report.seconds.write = clock.elapsed().as_secs_f64();
@@ -155,7 +193,7 @@ pub fn make(
 }
 
 /// The report without what another run would say differently.
-fn lasting(report: &Report) -> Value {
+fn lasting(report: &impl Serialize) -> Value {
     let mut value = json!(report);
     if let Some(members) = value.as_object_mut() {
         members.remove("seconds");
@@ -164,38 +202,8 @@ fn lasting(report: &Report) -> Value {
     value
 }
 
-fn pretty(report: &Report) -> Vec<u8> {
+fn pretty(report: &impl Serialize) -> Vec<u8> {
     let mut text = serde_json::to_vec_pretty(report).unwrap_or_default();
     text.push(b'\n');
     text
-}
-
-/// What a 2-D field made.
-pub struct CurveMade {
-    /// The curve as a glTF line loop.
-    pub glb: Vec<u8>,
-    /// The curve as SVG.
-    pub svg: Vec<u8>,
-    /// What was measured.
-    pub report: CurveReport,
-}
-
-impl CurveMade {
-    /// Whether the curve passed its own checks: closed and simple.
-    pub fn is_sound(&self) -> bool {
-        self.report.closed && self.report.simple
-    }
-}
-
-/// Shrinks a circle onto a field of dimension 2, with as many samples as a row of the lattice has.
-pub fn make_curve(field: &dyn Field, spec: &ShrinkSpec, settings: Settings<'_>) -> Result<CurveMade, Ended> {
-    let samples = match spec.lattice {
-        LatticeSpec::Latlong { n_theta, .. } => n_theta,
-        LatticeSpec::Octahedral { n } => 4 * n,
-    };
-    let tally = Tally::new();
-    let sampler = Sampler::new(field, settings, &tally);
-    let curve = shrink_curve(&sampler, &CurveSpec { method: spec.method, samples })?;
-    let report = curve.report;
-    Ok(CurveMade { glb: surface::curve::to_glb(&curve), svg: surface::curve::to_svg(&curve).into_bytes(), report })
 }

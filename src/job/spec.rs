@@ -7,6 +7,7 @@ use crate::blobs::BlobId;
 use crate::extract::Budget;
 use crate::field::input::FieldOptions;
 use crate::field::{Fault, FieldError};
+use crate::shrink::curve::{MAX_SAMPLES, MIN_SAMPLES};
 use crate::shrink::lattice::LatticeSpec;
 use crate::shrink::{Component, Density, Distortion, Effort, Method, OnTopology, ShrinkSpec};
 use serde::{Deserialize, Serialize};
@@ -19,6 +20,8 @@ pub const N_THETA: std::ops::RangeInclusive<u32> = 8..=2048;
 pub const N_PHI: std::ops::RangeInclusive<u32> = 4..=1024;
 /// Subdivisions of an octahedron edge: up to a million vertices.
 pub const OCTAHEDRAL_N: std::ops::RangeInclusive<u32> = 2..=500;
+/// Samples of a curve.
+pub const SAMPLES: std::ops::RangeInclusive<u32> = MIN_SAMPLES..=MAX_SAMPLES;
 /// Labels a job may have.
 pub const MAX_LABELS: usize = 16;
 /// Characters of a label's name.
@@ -38,7 +41,9 @@ pub enum OutputName {
     Glb,
     /// Positions, normals, UVs and fundamental forms as safetensors.
     Surface,
-    /// The surface from four sides as PNG.
+    /// The curve of a 2-D field as a drawing.
+    Svg,
+    /// The surface from four sides, or the curve, as PNG.
     Preview,
     /// Everything measured, as JSON.
     Report,
@@ -46,13 +51,15 @@ pub enum OutputName {
 
 impl OutputName {
     /// All of them.
-    pub const ALL: [OutputName; 4] = [OutputName::Glb, OutputName::Surface, OutputName::Preview, OutputName::Report];
+    pub const ALL: [OutputName; 5] =
+        [OutputName::Glb, OutputName::Surface, OutputName::Svg, OutputName::Preview, OutputName::Report];
 
     /// The name in JSON and in URLs.
     pub fn name(self) -> &'static str {
         match self {
             OutputName::Glb => "glb",
             OutputName::Surface => "surface",
+            OutputName::Svg => "svg",
             OutputName::Preview => "preview",
             OutputName::Report => "report",
         }
@@ -67,6 +74,7 @@ impl OutputName {
             OutputName::Glb => "model/gltf-binary",
             // no registered type; the one the format's own tools use is octet-stream
             OutputName::Surface => "application/octet-stream",
+            OutputName::Svg => "image/svg+xml",
             OutputName::Preview => "image/png",
             OutputName::Report => "application/json",
         }
@@ -76,6 +84,7 @@ impl OutputName {
         match self {
             OutputName::Glb => "glb",
             OutputName::Surface => "safetensors",
+            OutputName::Svg => "svg",
             OutputName::Preview => "png",
             OutputName::Report => "json",
         }
@@ -109,7 +118,7 @@ pub struct JobSpec {
     pub shrink: ShrinkSpec,
     /// What may be spent on it.
     pub budget: Budget,
-    /// What is made; `glb`, `preview` and `report` when nothing is said.
+    /// What is made; `glb`, `preview` and `report` when nothing is said, and `svg` of a 2-D field.
     pub outputs: Vec<OutputName>,
     /// Names the client gives the job; jobs can be listed by them.
     pub labels: BTreeMap<String, String>,
@@ -124,6 +133,31 @@ impl JobSpec {
         let mut faults = Faults::default();
         let spec = read_spec(value, &mut faults);
         if faults.0.is_empty() { Ok(spec) } else { Err(faults.0) }
+    }
+}
+
+impl JobSpec {
+    /// Fits a request to the dimension of its field: what only curves have is refused for surfaces, and what a request that
+    /// says nothing gets is completed. `request` is what the spec was read from.
+    pub fn for_dimension(mut self, dimension: u8, request: &Value) -> Result<Self, Vec<Fault>> {
+        if dimension == 2 {
+            if request.get("outputs").is_none() {
+                self.outputs.push(OutputName::Svg);
+                self.outputs.sort_unstable();
+            }
+            return Ok(self);
+        }
+        let mut faults = Faults::default();
+        let listed = request.get("outputs").and_then(Value::as_array).map(Vec::as_slice).unwrap_or_default();
+        if let Some(i) = listed.iter().position(|name| name == OutputName::Svg.name()) {
+            let detail = "svg is made of fields of dimension 2, and this one has dimension 3";
+            faults.add(format!("/outputs/{i}"), "dimension", detail);
+        }
+        if self.shrink.samples.is_some() {
+            let detail = "samples are those of a curve, and this field has dimension 3: it takes a lattice";
+            faults.add("/shrink/samples", "dimension", detail);
+        }
+        if faults.0.is_empty() { Ok(self) } else { Err(faults.0) }
     }
 }
 
@@ -304,7 +338,7 @@ fn read_latent(value: &Value, faults: &mut Faults) -> Option<Vec<f32>> {
 
 fn read_shrink(value: &Value, faults: &mut Faults) -> ShrinkSpec {
     let mut shrink = ShrinkSpec::default();
-    let known = ["method", "lattice", "density", "distortion", "on_topology", "component"];
+    let known = ["method", "lattice", "density", "distortion", "on_topology", "component", "samples"];
     let Some(object) = faults.object(value, "/shrink", &known) else { return shrink };
     use {Density as D, Distortion as K, Method as M, OnTopology as T};
     let methods = [("adaptive", M::Adaptive), ("paper", M::Paper)];
@@ -319,6 +353,13 @@ fn read_shrink(value: &Value, faults: &mut Faults) -> ShrinkSpec {
     if let Some(lattice) = object.get("lattice").and_then(|lattice| read_lattice(lattice, faults)) {
         faults.0.extend(check_lattice(lattice, "/shrink/lattice"));
         shrink.lattice = lattice;
+    }
+    if let Some(samples) = object.get("samples") {
+        shrink.samples = faults.count(samples, "/shrink/samples");
+        if let Some(n) = shrink.samples.filter(|n| !SAMPLES.contains(n)) {
+            let detail = format!("{n} is not in {} to {}", SAMPLES.start(), SAMPLES.end());
+            faults.add("/shrink/samples", "out_of_range", detail);
+        }
     }
     shrink
 }
@@ -588,6 +629,23 @@ mod tests {
         let odd = json!({"field": {"scene": {}, "domain": "large", "activation": "magic", "transform": {"scael": 2}}});
         let places = ["/field/transform", "/field/domain", "/field/activation"];
         assert_eq!(faults(odd), places.map(|p| (p.to_owned(), "invalid_value")));
+    }
+
+    #[test]
+    fn what_only_curves_have_is_refused_for_surfaces_by_its_place() {
+        let request = json!({"field": {"scene": {}}, "shrink": {"samples": 500}, "outputs": ["report", "svg"]});
+        let spec = JobSpec::from_value(&request).expect("good for a curve");
+        assert_eq!(spec.clone().for_dimension(2, &request), Ok(spec.clone()));
+        let found = spec.for_dimension(3, &request).expect_err("no curve");
+        let places: Vec<&str> = found.iter().map(|f| f.pointer.as_str()).collect();
+        assert_eq!(places, ["/outputs/1", "/shrink/samples"]);
+        let silent = json!({"field": {"scene": {}}});
+        let spec = JobSpec::from_value(&silent).expect("good").for_dimension(2, &silent).expect("good");
+        assert_eq!(spec.outputs, [OutputName::Glb, OutputName::Svg, OutputName::Preview, OutputName::Report]);
+        for samples in [7, 100_001] {
+            let value = json!({"field": {"scene": {}}, "shrink": {"samples": samples}});
+            assert_eq!(faults(value), [("/shrink/samples".to_owned(), "out_of_range")]);
+        }
     }
 
     #[test]

@@ -166,7 +166,7 @@ impl Worker {
         claim: Claim,
         cancel: CancelToken,
         news: mpsc::UnboundedSender<Update>,
-    ) -> impl Future<Output = Result<pipeline::Made, Ended>> + Send + use<> {
+    ) -> impl Future<Output = Result<pipeline::Finished, Ended>> + Send + use<> {
         let (blobs, pool) = (self.blobs.clone(), self.pool.clone());
         async move {
             let clock = Instant::now();
@@ -194,7 +194,7 @@ impl Worker {
                 let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress };
                 let load = clock.elapsed().as_secs_f64();
                 let spec = &claim.spec;
-                pipeline::make(&opened, &spec.shrink, spec.budget, &spec.outputs, load, settings)
+                pipeline::run(&opened, &spec.shrink, spec.budget, &spec.outputs, load, settings)
             };
             tokio::task::spawn_blocking(compute).await.unwrap_or_else(|panic| {
                 tracing::error!(%panic, "the computation panicked");
@@ -204,8 +204,8 @@ impl Worker {
     }
 
     /// Stores the outputs; they are durable before the outcome that names them is told.
-    async fn store(&self, claim: &Claim, made: pipeline::Made) -> Outcome {
-        let (certified, problem) = (made.is_sound(), made.problem());
+    async fn store(&self, claim: &Claim, made: pipeline::Finished) -> Outcome {
+        let certified = made.certified;
         let mut outputs = Vec::new();
         for (name, bytes) in made.files {
             let size = bytes.len() as u64;
@@ -224,8 +224,8 @@ impl Worker {
                 }
             }
         }
-        let metrics = serde_json::to_value(&made.report).unwrap_or_default();
-        match problem {
+        let metrics = made.metrics;
+        match made.problem {
             None => Outcome::Succeeded { outputs, metrics },
             Some(problem) => Outcome::Failed { problem, outputs, metrics: Some(metrics) },
         }

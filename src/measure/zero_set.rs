@@ -42,7 +42,7 @@ const SLACK: f64 = 2.0;
 /// Rounds of bracketed root finding; every third one halves the bracket, so that it ends at 2^-14 of its length at worst.
 const ROUNDS: usize = 42;
 /// Share of the grid spacing to which a root is found: a millionth of the domain, near the end of single precision.
-const TIGHT: f64 = 1e-4;
+pub(super) const TIGHT: f64 = 1e-4;
 
 /// Finds points on the zero level set over the sampler's whole domain.
 ///
@@ -176,11 +176,11 @@ fn collect(grid: &Grid, cells: &[IVec3], sampler: &Sampler<'_>) -> Result<ZeroSe
 
 /// A segment whose ends differ in sign.
 #[derive(Clone, Copy)]
-struct Bracket {
-    from: DVec3,
-    to: DVec3,
-    at_from: f64,
-    at_to: f64,
+pub(super) struct Bracket {
+    pub(super) from: DVec3,
+    pub(super) to: DVec3,
+    pub(super) at_from: f64,
+    pub(super) at_to: f64,
 }
 
 impl Bracket {
@@ -198,7 +198,7 @@ impl Bracket {
 
 /// A root in every bracket, to within `tight`: two secant steps, one halving, and again, so that values that are no distance
 /// cannot stall it.
-fn roots(mut brackets: Vec<Bracket>, tight: f64, sampler: &Sampler<'_>) -> Result<Vec<DVec3>, Canceled> {
+pub(super) fn roots(mut brackets: Vec<Bracket>, tight: f64, sampler: &Sampler<'_>) -> Result<Vec<DVec3>, Canceled> {
     for round in 0..ROUNDS {
         let open: Vec<usize> = (0..brackets.len()).filter(|&i| !brackets[i].is_closed(tight)).collect();
         if open.is_empty() {

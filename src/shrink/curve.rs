@@ -1,49 +1,63 @@
 //! Circle to curve: the two-dimensional form of shrinking, for fields of dimension 2.
 //!
-//! `method: adaptive` contours the field on a lattice that is refined towards the zero set, where the topology is plain to
-//! see, puts the crossings and the corners exactly, and samples the loop by arc length: the curve is closed, and simple unless
-//! the samples are too few for a gap (the report says). `method: paper` is the paper's loop, the baseline: it promises
-//! nothing. Both are judged against the same contour of the field. Work is done in a frame in which the longer side of
-//! the domain is 2; results are in scene units.
+//! `method: adaptive` contours the field on a triangulation that is refined towards the zero set, where the topology is plain to
+//! see, puts crossings and corners exactly, and samples the loop by arc length: the curve is closed, and simple unless
+//! the samples are too few for a gap. `method: paper` is the paper's loop, the baseline: it promises nothing. What a
+//! curve is worth is measured in [`crate::measure::curve`]. Work is done in a frame in which the longer side of the domain is
+//! 2; results are in scene units, rounded to single precision as they are written.
 
+mod bisection;
 mod contour;
+mod corners;
 mod paper;
 mod polyline;
+mod spread;
 #[cfg(test)]
 mod tests;
 
-use super::{Method, ShrinkError};
-use crate::field::{Counts, Frame, Sampler};
+use super::{Component, Effort, Method, OnTopology, ShrinkError, ShrinkSpec};
+use crate::field::{Frame, Sampler};
 use crate::settings::Progress;
-use contour::{Contour, Loop};
+use contour::Loop;
 use glam::{DVec2, DVec3};
-use polyline::{Segments, perimeter, self_intersections, turning};
+use polyline::{contains, double_area, perimeter};
 
 /// Fewest samples of a curve.
 pub const MIN_SAMPLES: u32 = 8;
 /// Most samples of a curve.
-pub const MAX_SAMPLES: u32 = 10_000;
+pub const MAX_SAMPLES: u32 = 100_000;
 
 /// What to make of a two-dimensional field.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
-#[serde(deny_unknown_fields, default)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct CurveSpec {
     /// How the circle is contracted.
     pub method: Method,
     /// Samples of the curve; taken to the nearest number from [`MIN_SAMPLES`] to [`MAX_SAMPLES`].
     pub samples: u32,
+    /// What to do with a solid that has holes.
+    pub on_topology: OnTopology,
+    /// Which component to take where there are several; without it several are refused.
+    pub component: Option<Component>,
 }
 
 impl Default for CurveSpec {
     fn default() -> Self {
-        Self { method: Method::Adaptive, samples: 400 }
+        Self { method: Method::Adaptive, samples: 400, on_topology: OnTopology::Refuse, component: None }
+    }
+}
+
+impl From<&ShrinkSpec> for CurveSpec {
+    /// As many samples as are asked for; otherwise as a row of the lattice has.
+    fn from(spec: &ShrinkSpec) -> Self {
+        let samples = spec.curve_samples();
+        Self { method: spec.method, samples, on_topology: spec.on_topology, component: spec.component }
     }
 }
 
 /// A closed curve with a parameter: the polygon through `positions`, the last one joined to the first.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Curve {
-    /// Sample positions in scene units, counter-clockwise (the solid on the left).
+    /// Sample positions in scene units, counter-clockwise (the solid on the left), single-precision numbers.
     pub positions: Vec<[f64; 2]>,
     /// Unit outward normals: the field's gradient, at a corner the mean of both sides'.
     pub normals: Vec<[f64; 2]>,
@@ -51,57 +65,77 @@ pub struct Curve {
     pub parameters: Vec<f64>,
     /// Whether the sample is a corner of the zero set.
     pub corners: Vec<bool>,
-    /// What was measured.
-    pub report: CurveReport,
+    /// The field's value at every sample, scene units.
+    pub values: Vec<f64>,
+    /// Length of the field's gradient at every sample.
+    pub gradient_norms: Vec<f64>,
+    /// What was left out on request.
+    pub left_out: LeftOut,
 }
 
-/// Everything measured about a curve.
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
-pub struct CurveReport {
-    /// Samples.
-    pub samples: u64,
-    /// Whether the polygon goes once around counter-clockwise without a sample on top of the one before it.
-    pub closed: bool,
-    /// Whether no two edges of the polygon meet that are not neighbours.
-    pub simple: bool,
-    /// Pairs of edges that meet and are not neighbours.
-    pub self_intersections: u64,
-    /// Corners of the zero set that are samples.
-    pub corners: u64,
-    /// Length of the polygon, scene units.
-    pub length: f64,
-    /// From the polygon (vertices and edge midpoints) to the zero set, in parts of its bounding-box diagonal.
-    pub to_zero_set: CurveDistance,
-    /// From the zero set to the polygon, in the same parts.
-    pub from_zero_set: CurveDistance,
-    /// Field evaluations spent to make the curve (measuring not counted).
-    pub evaluations: Counts,
-}
-
-/// Mean and largest distance.
+/// Parts of the zero set that a curve does not follow, because it was asked to.
 #[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
-pub struct CurveDistance {
-    /// Mean over samples.
-    pub mean: f64,
-    /// Largest.
-    pub max: f64,
+pub struct LeftOut {
+    /// Components other than the one that was chosen.
+    pub components: u64,
+    /// Holes of the chosen component that the curve goes around.
+    pub holes: u64,
+    /// Area of these holes, squared scene units.
+    pub hole_area: f64,
+}
+
+/// How closely a contour is looked at, in the frame.
+#[derive(Clone, Copy, Debug)]
+struct Detail {
+    /// Triangles near the zero set are no larger anywhere, ...
+    coarsest: f64,
+    /// ... and no smaller than about half of this where that does not explain the values.
+    finest: f64,
+}
+
+impl Detail {
+    /// Of an attempt, from 0. Where nothing bounds the field, thin things between the vertices go unnoticed more easily.
+    fn of(attempt: u32, bounded: bool) -> Self {
+        let halvings = 2f64.powi(-(attempt.min(2) as i32));
+        let coarsest = if bounded { 0.012 } else { 0.006 } * halvings;
+        Self { coarsest, finest: 4e-4 * halvings.powi(2) }
+    }
 }
 
 /// Positions, normals and parameters of a curve in the frame.
+#[derive(Default)]
 struct Samples {
     positions: Vec<DVec2>,
     normals: Vec<DVec2>,
     parameters: Vec<f64>,
     corners: Vec<bool>,
+    /// Longest step towards the zero set.
+    reaches: Vec<f64>,
+    values: Vec<f64>,
+    slopes: Vec<f64>,
 }
 
-/// Contracts a circle onto the zero set of the sampler's two-dimensional field.
+impl Samples {
+    fn with_capacity(count: usize) -> Self {
+        Self {
+            positions: Vec::with_capacity(count),
+            normals: Vec::with_capacity(count),
+            parameters: Vec::with_capacity(count),
+            corners: Vec::with_capacity(count),
+            reaches: Vec::with_capacity(count),
+            ..Self::default()
+        }
+    }
+}
+
+/// Contracts a circle onto the zero set of the sampler's two-dimensional field. Later attempts look more closely, and place the
+/// samples where the curve bends.
 ///
 /// # Errors
 /// [`ShrinkError::Dimension`] for a field of dimension 3, [`ShrinkError::Canceled`] when the run was canceled, and for
 /// `method: adaptive` [`ShrinkError::Empty`], [`ShrinkError::Components`] and [`ShrinkError::Genus`] (the number of holes) when the
 /// zero set is not one loop. `method: paper` returns what comes out, as long as there is a zero set.
-pub fn shrink_curve(sampler: &Sampler<'_>, spec: &CurveSpec) -> Result<Curve, ShrinkError> {
+pub fn shrink_curve(sampler: &Sampler<'_>, spec: &CurveSpec, effort: &Effort) -> Result<Curve, ShrinkError> {
     let found = sampler.field().dimension();
     if found != 2 {
         return Err(ShrinkError::Dimension { found, wanted: 2 });
@@ -115,171 +149,99 @@ pub fn shrink_curve(sampler: &Sampler<'_>, spec: &CurveSpec) -> Result<Curve, Sh
     let report = |stage, fraction| {
         (sampler.settings().progress)(Progress { stage, fraction, ..Progress::default() });
     };
-
-    let before = sampler.tally().total();
     report("contract", 0.0);
-    let (samples, contour) = match spec.method {
+    let (samples, left_out) = match spec.method {
         Method::Adaptive => {
             sampler.tally().stage("contract");
-            let contour = Contour::new(&framed)?;
-            let the_loop = contour.only_loop(frame)?;
+            let detail = Detail::of(effort.attempt, sampler.field().lipschitz().is_some());
+            let loops = contour::contour(&framed, detail)?;
+            let (mut the_loop, left_out) = chosen(loops, spec, frame)?;
             sampler.tally().stage("resample");
             report("resample", 0.7);
-            (adaptive(&framed, the_loop, count, contour.spacing)?, Some(contour))
+            spread::resolve_bends(&framed, &mut the_loop)?;
+            (spread::spread(&framed, &the_loop, count, f64::from(effort.attempt))?, left_out)
         }
         Method::Paper => {
             sampler.tally().stage("paper");
-            (paper::shrink(&framed, count)?, None)
+            (paper::shrink(&framed, count)?, LeftOut::default())
         }
     };
-    let after = sampler.tally().total();
-    sampler.tally().stage("measure");
-    report("measure", 0.9);
-    let contour = match contour {
-        Some(contour) => contour,
-        None => Contour::new(&framed)?,
-    };
-    let evaluations = Counts { value: after.value - before.value, gradient: after.gradient - before.gradient };
-    let report = measure(&samples, &contour, frame.scale, evaluations);
+    let single = |v: DVec2| v.as_vec2().as_dvec2().to_array();
     Ok(Curve {
-        positions: samples.positions.iter().map(|q| frame.to_scene(q.extend(0.0)).truncate().to_array()).collect(),
+        positions: samples.positions.iter().map(|q| single(frame.to_scene(q.extend(0.0)).truncate())).collect(),
         normals: samples.normals.iter().map(|n| n.to_array()).collect(),
         parameters: samples.parameters,
         corners: samples.corners,
-        report,
+        values: samples.values.iter().map(|s| s * frame.scale).collect(),
+        gradient_norms: samples.slopes,
+        left_out,
     })
 }
 
-/// Samples `the_loop` by arc length with its corners among the samples: between two corners the samples are evenly
-/// spaced, as many as the length there asks for.
-fn adaptive(sampler: &Sampler<'_>, the_loop: &Loop, count: usize, reach: f64) -> Result<Samples, ShrinkError> {
-    let n = the_loop.points.len();
-    let mut anchors: Vec<usize> = (0..n).filter(|&i| the_loop.corners[i]).collect();
-    // half of the samples stay free to be even
-    let most = count / 2;
-    if anchors.len() > most {
-        // the sharpest stay
-        let sharpness = |i: &usize| {
-            let p = |k: usize| the_loop.points[k % n];
-            let (a, b) = (p(i + n) - p(i + n - 1), p(i + 1) - p(i + n));
-            a.normalize_or_zero().dot(b.normalize_or_zero())
-        };
-        anchors.sort_by(|a, b| sharpness(a).total_cmp(&sharpness(b)).then(a.cmp(b)));
-        anchors.truncate(most);
-        anchors.sort_unstable();
-    }
-    let rightmost = |a: &usize, b: &usize| the_loop.points[*a].x.total_cmp(&the_loop.points[*b].x).then(b.cmp(a));
-    if anchors.is_empty() {
-        anchors.extend((0..n).max_by(rightmost));
-    }
-    // the parameter starts at the rightmost anchor
-    if let Some(first) = (0..anchors.len()).max_by(|&a, &b| rightmost(&anchors[a], &anchors[b])) {
-        anchors.rotate_left(first);
-    }
-    let start = anchors[0];
-    let order: Vec<usize> = (0..=n).map(|k| (start + k) % n).collect();
-    let mut arc = vec![0.0; n + 1];
-    for k in 0..n {
-        arc[k + 1] = arc[k] + the_loop.points[order[k]].distance(the_loop.points[order[k + 1]]);
-    }
-    let total = arc[n];
-    let mut stops: Vec<usize> = anchors.iter().map(|&a| (a + n - start) % n).collect();
-    stops.push(n);
-    let shares: Vec<f64> = stops.windows(2).map(|w| arc[w[1]] - arc[w[0]]).collect();
-    let counts = apportion(&shares, count);
-
-    let mut out = Samples { positions: vec![], normals: vec![], parameters: vec![], corners: vec![] };
-    for (w, &pieces) in stops.windows(2).zip(&counts) {
-        let mut k = w[0];
-        for piece in 0..pieces {
-            let s = arc[w[0]] + (arc[w[1]] - arc[w[0]]) * piece as f64 / pieces as f64;
-            while k + 1 < w[1] && arc[k + 1] <= s {
-                k += 1;
-            }
-            let t = ((s - arc[k]) / (arc[k + 1] - arc[k])).clamp(0.0, 1.0);
-            let (a, b) = (order[k], order[k + 1]);
-            out.positions.push(the_loop.points[a].lerp(the_loop.points[b], t));
-            out.normals.push(the_loop.normals[a].lerp(the_loop.normals[b], t).normalize_or(DVec2::X));
-            out.parameters.push(s / total);
-            out.corners.push(piece == 0 && the_loop.corners[a]);
-        }
-    }
-    settle(sampler, &mut out, reach)?;
-    Ok(out)
+/// A component of the solid: its outer boundary and its holes, as indices.
+struct Part {
+    outer: usize,
+    holes: Vec<usize>,
+    area: f64,
 }
 
-/// Splits `count` into whole parts proportional to `shares`, each at least 1 (largest remainders; `count` >= the number of shares).
-fn apportion(shares: &[f64], count: usize) -> Vec<usize> {
-    let total: f64 = shares.iter().sum();
-    let spare = (count - shares.len()) as f64;
-    let wanted: Vec<f64> = shares.iter().map(|s| spare * s / total.max(f64::MIN_POSITIVE)).collect();
-    let mut parts: Vec<usize> = wanted.iter().map(|w| 1 + *w as usize).collect();
-    let mut order: Vec<usize> = (0..shares.len()).collect();
-    order.sort_by(|&a, &b| wanted[b].fract().total_cmp(&wanted[a].fract()).then(a.cmp(&b)));
-    let left = count.saturating_sub(parts.iter().sum());
-    for &i in order.iter().cycle().take(left) {
-        parts[i] += 1;
+/// The components, largest area first.
+fn parts(loops: &[Loop]) -> Vec<Part> {
+    let areas: Vec<f64> = loops.iter().map(|l| 0.5 * double_area(&l.points)).collect();
+    let outers = (0..loops.len()).filter(|&i| areas[i] > 0.0);
+    let mut parts: Vec<Part> = outers.map(|i| Part { outer: i, holes: Vec::new(), area: areas[i] }).collect();
+    for hole in (0..loops.len()).filter(|&i| areas[i] <= 0.0) {
+        let Some(&place) = loops[hole].points.first() else { continue };
+        // the smallest boundary around it
+        let around = parts.iter_mut().filter(|p| contains(&loops[p.outer].points, place));
+        if let Some(part) = around.min_by(|a, b| areas[a.outer].total_cmp(&areas[b.outer])) {
+            part.holes.push(hole);
+        }
     }
+    for part in &mut parts {
+        part.area += part.holes.iter().map(|&h| areas[h]).sum::<f64>();
+    }
+    parts.sort_by(|a, b| b.area.total_cmp(&a.area).then(a.outer.cmp(&b.outer)));
     parts
 }
 
-/// Moves samples between corners onto the zero set by Newton steps no longer than `reach`, each kept only where the value
-/// falls, and takes the normals there.
-fn settle(sampler: &Sampler<'_>, samples: &mut Samples, reach: f64) -> Result<(), ShrinkError> {
-    /// One step leaves the chord's error squared, the second is for fields that are no distances.
-    const STEPS: usize = 2;
-    let free: Vec<usize> = (0..samples.positions.len()).filter(|&i| !samples.corners[i]).collect();
-    let mut q: Vec<DVec3> = free.iter().map(|&i| samples.positions[i].extend(0.0)).collect();
-    let (mut s, mut g) = sampler.gradients(&q)?;
-    for _ in 0..STEPS {
-        let moved: Vec<DVec3> = (0..q.len())
-            .map(|i| {
-                let step = -s[i] * g[i] / g[i].length_squared().max(f64::MIN_POSITIVE);
-                q[i] + step.clamp_length_max(reach)
-            })
-            .collect();
-        let (after, slopes) = sampler.gradients(&moved)?;
-        for i in 0..q.len() {
-            if after[i].abs() < s[i].abs() {
-                (q[i], s[i], g[i]) = (moved[i], after[i], slopes[i]);
-            }
-        }
+/// The loop to follow, and what is left out with it.
+fn chosen(mut loops: Vec<Loop>, spec: &CurveSpec, frame: Frame) -> Result<(Loop, LeftOut), ShrinkError> {
+    let parts = parts(&loops);
+    let places = |which: &mut dyn Iterator<Item = usize>, side: f64| -> Vec<[f64; 3]> {
+        which.take(16).map(|i| frame.to_scene(beside(&loops[i], side).extend(0.0)).to_array()).collect()
+    };
+    let part = match (spec.component, &parts[..]) {
+        (None, [only]) => Some(only),
+        (None, _) => None,
+        (Some(Component::Largest), all) => all.first(),
+        (Some(Component::Index(i)), all) => all.get(i as usize),
+    };
+    let Some(part) = part else {
+        let (count, places) = (parts.len(), places(&mut parts.iter().map(|p| p.outer), -1.0));
+        return Err(match spec.component {
+            Some(Component::Index(index)) => ShrinkError::NoComponent { index, count, places },
+            _ => ShrinkError::Components { count, places },
+        });
+    };
+    if !part.holes.is_empty() && spec.on_topology == OnTopology::Refuse {
+        let holes = &mut part.holes.iter().copied();
+        return Err(ShrinkError::Genus { genus: part.holes.len(), places: places(holes, 1.0) });
     }
-    for (&i, (q, g)) in free.iter().zip(q.iter().zip(&g)) {
-        samples.positions[i] = q.truncate();
-        samples.normals[i] = g.truncate().normalize_or(samples.normals[i]);
-    }
-    Ok(())
+    let area = |&h: &usize| -0.5 * double_area(&loops[h].points) * frame.scale * frame.scale;
+    let left_out = LeftOut {
+        components: parts.len() as u64 - 1,
+        holes: part.holes.len() as u64,
+        hole_area: part.holes.iter().map(area).sum(),
+    };
+    Ok((loops.swap_remove(part.outer), left_out))
 }
 
-fn measure(samples: &Samples, contour: &Contour, scale: f64, evaluations: Counts) -> CurveReport {
-    let polygon = &samples.positions;
-    let n = polygon.len();
-    let mut probes = polygon.clone();
-    probes.extend((0..n).map(|i| 0.5 * (polygon[i] + polygon[(i + 1) % n])));
-    let truth: Vec<&[DVec2]> = contour.loops.iter().map(|l| l.points.as_slice()).collect();
-    let all = truth.iter().flat_map(|l| l.iter());
-    let lo = all.clone().fold(DVec2::INFINITY, |a, &p| a.min(p));
-    let hi = all.clone().fold(DVec2::NEG_INFINITY, |a, &p| a.max(p));
-    let distance = |from: &mut dyn Iterator<Item = DVec2>, to: &Segments| {
-        let (mut sum, mut max, mut count) = (0.0, 0f64, 0);
-        for p in from {
-            let d = to.distance(p) / (hi - lo).length();
-            (sum, max, count) = (sum + d, max.max(d), count + 1);
-        }
-        CurveDistance { mean: sum / f64::from(count.max(1)), max }
-    };
-    let crossings = self_intersections(polygon);
-    let apart = (0..n).all(|i| polygon[i] != polygon[(i + 1) % n]);
-    CurveReport {
-        samples: n as u64,
-        closed: apart && (turning(polygon) - 1.0).abs() < 1e-6,
-        simple: crossings == 0 && apart,
-        self_intersections: crossings,
-        corners: samples.corners.iter().filter(|c| **c).count() as u64,
-        length: scale * perimeter(polygon),
-        to_zero_set: distance(&mut probes.into_iter(), &Segments::new(&truth)),
-        from_zero_set: distance(&mut all.copied(), &Segments::new(&[polygon])),
-        evaluations,
-    }
+/// A point beside the loop's rightmost point, on the side of the gradient (1) or of the solid (-1).
+fn beside(l: &Loop, side: f64) -> DVec2 {
+    let rightmost = (0..l.points.len()).max_by(|&a, &b| l.points[a].x.total_cmp(&l.points[b].x)).unwrap_or(0);
+    let normal = (l.normals[rightmost][0] + l.normals[rightmost][1]).normalize_or(DVec2::X);
+    // no farther than the loop itself is wide
+    let width = double_area(&l.points).abs() / perimeter(&l.points);
+    l.points[rightmost] + side * (0.25 * l.sizes[rightmost]).min(0.5 * width) * normal
 }

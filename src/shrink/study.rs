@@ -400,6 +400,7 @@ mod tests {
         distortion: super::super::Distortion::Isometric,
         on_topology: OnTopology::Wrap,
         component: None,
+        samples: None,
     };
 
     fn component(component: Component) -> ShrinkSpec {

@@ -1,4 +1,11 @@
-//! Curves as files: a drawing (SVG) and a line loop (GLB), both in scene units with y upwards.
+//! Curves as files: a drawing (SVG), a line loop (GLB), a picture (PNG) and numbers (safetensors), in scene units with y
+//! upwards.
+
+mod picture;
+mod tensors;
+
+pub use picture::to_png;
+pub use tensors::{curvatures, to_safetensors};
 
 use crate::shrink::curve::Curve;
 use gltf_json as json;
@@ -22,20 +29,22 @@ pub fn to_svg(curve: &Curve) -> String {
     let longest = (hi[0] - lo[0]).max(hi[1] - lo[1]).max(f64::MIN_POSITIVE);
     let margin = MARGIN * longest;
     let (width, height) = (hi[0] - lo[0] + 2.0 * margin, hi[1] - lo[1] + 2.0 * margin);
+    // six digits of a curve of size 1, as many of any other
+    let digits = (6.0 - longest.log10().floor()).clamp(0.0, 16.0) as usize;
     let mut svg = String::new();
     // y is turned by the group, so the box starts at the negated top; writing to a string cannot fail
     let _ = writeln!(
         svg,
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"{:.6} {:.6} {width:.6} {height:.6}\">",
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"{:.digits$} {:.digits$} {width:.digits$} {height:.digits$}\">",
         lo[0] - margin,
         -(hi[1] + margin)
     );
     let _ = writeln!(svg, "<title>parameterized curve of {} samples</title>", curve.positions.len());
     let line = LINE * longest;
-    let _ = writeln!(svg, "<g transform=\"scale(1 -1)\" fill=\"none\" stroke-width=\"{line:.6}\">");
+    let _ = writeln!(svg, "<g transform=\"scale(1 -1)\" fill=\"none\" stroke-width=\"{line:.digits$}\">");
     let _ = write!(svg, "<path stroke=\"#222\" stroke-linejoin=\"round\" fill=\"#f4f1ea\" d=\"");
     for (i, p) in curve.positions.iter().enumerate() {
-        let _ = write!(svg, "{}{:.6} {:.6}", if i == 0 { "M" } else { "L" }, p[0], p[1]);
+        let _ = write!(svg, "{}{:.digits$} {:.digits$}", if i == 0 { "M" } else { "L" }, p[0], p[1]);
     }
     svg.push_str("Z\"/>\n");
     for k in 0..TICKS {
@@ -45,7 +54,7 @@ pub fn to_svg(curve: &Curve) -> String {
         let half = 0.5 * TICK * longest;
         let _ = writeln!(
             svg,
-            "<path stroke=\"#{r:02x}{g:02x}{b:02x}\" d=\"M{:.6} {:.6}L{:.6} {:.6}\"/>",
+            "<path stroke=\"#{r:02x}{g:02x}{b:02x}\" d=\"M{:.digits$} {:.digits$}L{:.digits$} {:.digits$}\"/>",
             p[0] - half * n[0],
             p[1] - half * n[1],
             p[0] + half * n[0],
@@ -53,7 +62,13 @@ pub fn to_svg(curve: &Curve) -> String {
         );
     }
     if let Some(p) = curve.positions.first() {
-        let _ = writeln!(svg, "<circle cx=\"{:.6}\" cy=\"{:.6}\" r=\"{:.6}\" fill=\"#f00\"/>", p[0], p[1], 2.5 * line);
+        let _ = writeln!(
+            svg,
+            "<circle cx=\"{:.digits$}\" cy=\"{:.digits$}\" r=\"{:.digits$}\" fill=\"#f00\"/>",
+            p[0],
+            p[1],
+            2.5 * line
+        );
     }
     svg.push_str("</g>\n</svg>\n");
     svg
@@ -86,9 +101,9 @@ fn hue(u: f64) -> [u8; 3] {
 }
 
 /// The curve as a binary glTF: one mesh with one primitive of mode `LINE_LOOP` in the plane z = 0, with POSITION, NORMAL and
-/// TEXCOORD_0 (u = the parameter, v = 1/2), and a texture of the colour circle that shows u in any viewer. The extras of
-/// the mesh hold the report.
-pub fn to_glb(curve: &Curve) -> Vec<u8> {
+/// TEXCOORD_0 (u = the parameter, v = 1/2), and a texture of the colour circle that shows u in any viewer. `report` and
+/// `provenance` (where the field came from) become the members of the root's `extras`.
+pub fn to_glb(curve: &Curve, report: &serde_json::Value, provenance: &serde_json::Value) -> Vec<u8> {
     let narrow = |v: &[[f64; 2]]| -> Vec<[f32; 3]> { v.iter().map(|p| [p[0] as f32, p[1] as f32, 0.0]).collect() };
     let (positions, normals) = (narrow(&curve.positions), narrow(&curve.normals));
     let fold = |f: fn(f32, f32) -> f32| -> json::Value {
@@ -114,10 +129,9 @@ pub fn to_glb(curve: &Curve) -> Vec<u8> {
         mode: Checked::Valid(json::mesh::Mode::LineLoop),
         targets: None,
     };
-    let report = serde_json::json!({ "report": curve.report });
     let mesh = file.root.push(json::Mesh {
         extensions: None,
-        extras: serde_json::value::to_raw_value(&report).ok(),
+        extras: None,
         name: Some("curve".to_owned()),
         primitives: vec![primitive],
         weights: None,
@@ -126,6 +140,8 @@ pub fn to_glb(curve: &Curve) -> Vec<u8> {
     let node = file.root.push(node);
     let scene = file.root.push(json::Scene { extensions: None, extras: None, name: None, nodes: vec![node] });
     file.root.scene = Some(scene);
+    let extras = serde_json::json!({ "report": report, "provenance": provenance });
+    file.root.extras = serde_json::value::to_raw_value(&extras).ok();
     file.finish()
 }
 
@@ -254,27 +270,17 @@ fn container(mut text: Vec<u8>, mut binary: Vec<u8>) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::shrink::curve::{CurveDistance, CurveReport};
 
-    fn diamond() -> Curve {
-        let distance = CurveDistance::default();
+    pub(super) fn diamond() -> Curve {
         let positions = vec![[2.0, 0.0], [0.0, 1.0], [-2.0, 0.0], [0.0, -1.0]];
         Curve {
             normals: positions.iter().map(|p: &[f64; 2]| p.map(|c| c.signum() * f64::from(c != 0.0))).collect(),
             positions,
             parameters: vec![0.0, 0.25, 0.5, 0.75],
             corners: vec![true; 4],
-            report: CurveReport {
-                samples: 4,
-                closed: true,
-                simple: true,
-                self_intersections: 0,
-                corners: 4,
-                length: 80f64.sqrt(),
-                to_zero_set: distance,
-                from_zero_set: distance,
-                evaluations: crate::field::Counts::default(),
-            },
+            values: vec![0.0; 4],
+            gradient_norms: vec![1.0; 4],
+            left_out: crate::shrink::curve::LeftOut::default(),
         }
     }
 
@@ -290,7 +296,7 @@ mod tests {
 
     #[test]
     fn the_glb_reads_back_as_a_line_loop_with_the_parameter_as_u() {
-        let glb = to_glb(&diamond());
+        let glb = to_glb(&diamond(), &serde_json::json!({"vertices": 4}), &serde_json::json!({}));
         let file = gltf::Gltf::from_slice(&glb).unwrap();
         let primitive = file.meshes().next().unwrap().primitives().next().unwrap();
         assert_eq!(primitive.mode(), gltf::mesh::Mode::LineLoop);

@@ -6,6 +6,7 @@ mod cli;
 mod conditional;
 mod contract;
 mod control;
+mod curves;
 mod evaluate;
 mod faults;
 mod metrics;

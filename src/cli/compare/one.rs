@@ -163,7 +163,10 @@ fn wrapped(
     match made {
         Guarded::Done(Ok(made)) => {
             row.attempts = Some(u64::from(made.report.attempts));
-            row.outcome = judged(&made, expected);
+            row.outcome = match made.problem() {
+                Some(problem) if made.refusal.is_some() => failed(problem, expected),
+                _ => judged(&made, expected),
+            };
             if let Some(folder) = task.keep {
                 keep(folder, shape, lattice, &made).map_err(Ended::Io)?;
             }

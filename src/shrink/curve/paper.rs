@@ -35,11 +35,14 @@ pub(super) fn shrink(sampler: &Sampler<'_>, count: usize) -> Result<Samples, Shr
         (points, moves) = (at(&points), at(&moves));
     }
     lift(&points, &mut lifted);
-    let (_, g) = sampler.gradients(&lifted)?;
+    let (values, g) = sampler.gradients(&lifted)?;
     Ok(Samples {
         normals: g.iter().map(|g| g.truncate().normalize_or(DVec2::X)).collect(),
         parameters: (0..count).map(|i| i as f64 / count as f64).collect(),
         corners: vec![false; count],
+        reaches: Vec::new(),
+        slopes: g.iter().map(|g| g.length()).collect(),
+        values,
         positions: points,
     })
 }

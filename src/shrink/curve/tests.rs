@@ -2,19 +2,33 @@
 
 use super::*;
 use crate::field::{Domain, Field, Gradients, Metric, Points, sampler::Tally, scene::Scene};
+use crate::measure::curve::{CurveReport, measure};
 use crate::settings::{CancelToken, Canceled, Settings};
 use serde_json::{Value, json};
+use std::f64::consts::TAU;
 
-fn shrunk(field: &dyn Field, spec: &CurveSpec, threads: usize) -> Result<Curve, ShrinkError> {
+/// The first attempt at a curve, and what the certificate says.
+fn shrunk(field: &dyn Field, spec: &CurveSpec, threads: usize) -> Result<(Curve, CurveReport), ShrinkError> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
     let (cancel, tally) = (CancelToken::new(), Tally::new());
     let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_| {} };
-    shrink_curve(&Sampler::new(field, settings, &tally), spec)
+    let sampler = Sampler::new(field, settings, &tally);
+    let curve = shrink_curve(&sampler, spec, &Effort::default())?;
+    let options = ShrinkSpec { method: spec.method, ..ShrinkSpec::default() };
+    let report = measure(&curve, &sampler, &tally.by_stage(), &options)?;
+    Ok((curve, CurveReport { threads: 0, ..report }))
 }
 
-fn adaptive_curve(scene: &Value, samples: u32) -> Result<Curve, ShrinkError> {
+fn adaptive_curve(scene: &Value, samples: u32) -> Result<(Curve, CurveReport), ShrinkError> {
     let scene = Scene::from_value(scene).unwrap();
-    shrunk(&scene, &CurveSpec { method: Method::Adaptive, samples }, 1)
+    shrunk(&scene, &CurveSpec { samples, ..CurveSpec::default() }, 1)
+}
+
+/// A curve that must pass.
+fn sound(scene: &Value, samples: u32) -> (Curve, CurveReport) {
+    let (curve, report) = adaptive_curve(scene, samples).unwrap();
+    assert!(report.verdict.passed, "{scene}: {report:?}");
+    (curve, report)
 }
 
 fn example(name: &str) -> Scene {
@@ -26,15 +40,38 @@ fn disc(radius: f64, at: [f64; 2]) -> Value {
     json!({"translate": {"by": at, "of": {"circle": {"radius": radius}}}})
 }
 
+fn difference(of: &[Value]) -> Value {
+    json!({"difference": {"of": of}})
+}
+
+fn rectangle(half_extents: [f64; 2], at: [f64; 2]) -> Value {
+    json!({"translate": {"by": at, "of": {"rectangle": {"half_extents": half_extents}}}})
+}
+
+/// A star polygon: `n` tips at radius 1, `n` notches at `inner`, times `size`.
+fn star(n: usize, inner: f64, size: f64) -> Vec<[f64; 2]> {
+    let at = |i: usize| (size * if i % 2 == 0 { 1.0 } else { inner }, std::f64::consts::PI * i as f64 / n as f64);
+    (0..2 * n).map(at).map(|(r, a)| [r * a.cos(), r * a.sin()]).collect()
+}
+
+/// Whether every place is a sample that is a corner.
+fn assert_corners(curve: &Curve, places: &[[f64; 2]]) {
+    for place in places {
+        let near = |p: &[f64; 2]| (p[0] - place[0]).hypot(p[1] - place[1]);
+        let (i, _) = curve.positions.iter().enumerate().min_by(|a, b| near(a.1).total_cmp(&near(b.1))).unwrap();
+        assert!(curve.corners[i] && near(&curve.positions[i]) < 2e-6, "{place:?}: {:?}", curve.positions[i]);
+    }
+}
+
 #[test]
 fn every_planar_example_becomes_a_closed_simple_curve_on_its_zero_set() {
-    for name in ["blend", "disc", "gear", "letter_g", "letter_s", "plate"] {
-        let curve = shrunk(&example(name), &CurveSpec::default(), 2).unwrap();
-        let report = curve.report;
-        assert!(report.closed && report.simple, "{name}: {report:?}");
-        // a chord of length l leaves an arc of radius r by l^2/8r: 400 chords, roundings of 0.025 or more, a diagonal of 2
-        assert!(report.to_zero_set.max.max(report.from_zero_set.max) < 6e-4, "{name}: {report:?}");
-        assert!(report.to_zero_set.mean < 1e-4 && report.from_zero_set.mean < 1e-4, "{name}: {report:?}");
+    for entry in std::fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/examples/scenes/2d")).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_stem().unwrap().to_string_lossy().into_owned();
+        let (curve, report) = shrunk(&example(&name), &CurveSpec::default(), 2).unwrap();
+        assert!(report.verdict.passed, "{name}: {report:?}");
+        assert!(report.distance.max < 2e-3 && report.distance.mean < 3e-4, "{name}: {report:?}");
+        assert!(report.arc_length.deviation_max < 0.01, "{name}: {report:?}");
         assert_eq!(curve.positions.len(), 400);
         assert_eq!(curve.parameters[0], 0.0);
         assert!(curve.parameters.windows(2).all(|w| w[0] < w[1]) && curve.parameters[399] < 1.0, "{name}");
@@ -44,34 +81,56 @@ fn every_planar_example_becomes_a_closed_simple_curve_on_its_zero_set() {
 
 #[test]
 fn the_samples_of_a_disc_are_on_its_circle_and_even() {
-    let curve = adaptive_curve(&disc(0.5, [0.2, -0.1]), 100).unwrap();
+    let (curve, report) = sound(&disc(0.5, [0.2, -0.1]), 100);
     for (i, p) in curve.positions.iter().enumerate() {
-        let angle = (p[1] + 0.1).atan2(p[0] - 0.2).rem_euclid(std::f64::consts::TAU) / std::f64::consts::TAU;
+        let angle = (p[1] + 0.1).atan2(p[0] - 0.2).rem_euclid(TAU) / TAU;
         assert!(((p[0] - 0.2).hypot(p[1] + 0.1) - 0.5).abs() < 1e-6);
-        let turned = (angle - curve.parameters[i]).rem_euclid(1.0);
-        assert!(turned.min(1.0 - turned) < 2e-3, "sample {i} is at {angle} of the circle");
-        assert!((curve.parameters[i] - i as f64 / 100.0).abs() < 1e-12);
+        // the first sample is the rightmost crossing of the mesh, near angle 0
+        let start = (curve.positions[0][1] + 0.1).atan2(curve.positions[0][0] - 0.2) / TAU;
+        let turned = (angle - start - curve.parameters[i]).rem_euclid(1.0);
+        assert!(turned.min(1.0 - turned) < 1e-5, "sample {i} is at {angle} of the circle");
+        assert!((curve.parameters[i] - i as f64 / 100.0).abs() < 1e-6);
     }
+    assert!(report.arc_length.deviation_max < 1e-4, "{report:?}");
 }
 
 #[test]
 fn every_corner_of_a_polygon_is_a_sample() {
     let corners = [[-0.7, -0.6], [0.8, -0.5], [0.75, 0.1], [0.2, 0.0], [0.3, 0.7], [-0.1, 0.15], [-0.6, 0.6]];
-    let curve = adaptive_curve(&json!({"polygon": {"points": corners}}), 64).unwrap();
-    assert_eq!(curve.report.corners, 7);
-    assert_eq!(curve.positions.len(), 64);
-    for corner in corners {
-        let near = |p: &[f64; 2]| (p[0] - corner[0]).hypot(p[1] - corner[1]);
-        let (i, _) = curve.positions.iter().enumerate().min_by(|a, b| near(a.1).total_cmp(&near(b.1))).unwrap();
-        assert!(curve.corners[i] && near(&curve.positions[i]) < 1e-6, "{corner:?}: {:?}", curve.positions[i]);
-    }
-    assert!(curve.report.from_zero_set.max < 1e-6, "{:?}", curve.report);
+    let (curve, report) = sound(&json!({"polygon": {"points": corners}}), 64);
+    assert_eq!((report.corners, report.vertices), (7, 64));
+    assert_corners(&curve, &corners);
+    assert!(report.distance.max < 1e-6, "{report:?}");
 }
 
 #[test]
-fn a_rounding_is_no_corner() {
-    let rounded = json!({"round": {"radius": 0.1, "of": {"rectangle": {"half_extents": [0.5, 0.3]}}}});
-    assert_eq!(adaptive_curve(&rounded, 200).unwrap().report.corners, 0);
+fn the_tips_of_a_sharp_star_are_samples_to_the_last_digit() {
+    // tips of some 8 degrees, which the mesh loses long before they end
+    let corners = star(9, 0.2, 0.85);
+    let (curve, report) = sound(&json!({"polygon": {"points": corners}}), 500);
+    assert_eq!(report.corners, 18);
+    assert_corners(&curve, &corners);
+}
+
+#[test]
+fn corners_of_curved_sides_are_found_where_the_sides_meet() {
+    let lens = json!({"intersection": {"of": [disc(0.7, [-0.5, 0.0]), disc(0.7, [0.5, 0.0])]}});
+    let (curve, report) = sound(&lens, 200);
+    assert_eq!(report.corners, 2);
+    let tip = 0.24f64.sqrt();
+    assert_corners(&curve, &[[0.0, tip], [0.0, -tip]]);
+}
+
+#[test]
+fn a_rounding_is_no_corner_however_small() {
+    for radius in [0.1, 0.01, 0.002] {
+        let half = [0.5 - radius, 0.3 - radius];
+        let rounded = json!({"round": {"radius": radius, "of": {"rectangle": {"half_extents": half}}}});
+        let (_, report) = sound(&rounded, 200);
+        assert_eq!(report.corners, 0, "{radius}: {report:?}");
+        let length = 4.0 * (half[0] + half[1]) + TAU * radius;
+        assert!((report.arc_length.length - length).abs() < 1e-3 * length, "{radius}: {report:?}");
+    }
 }
 
 #[test]
@@ -80,48 +139,103 @@ fn a_zero_set_that_is_not_one_loop_is_refused_with_its_places() {
     let Err(ShrinkError::Components { count: 2, places }) = adaptive_curve(&two, 100) else { panic!() };
     assert!((places[0][0] + 0.5).hypot(places[0][1]) < 0.3 && (places[1][0] - 0.5).hypot(places[1][1]) < 0.2);
     let ring = json!({"shell": {"thickness": 0.1, "of": {"circle": {"radius": 0.5}}}});
-    assert!(matches!(adaptive_curve(&ring, 100), Err(ShrinkError::Genus { genus: 1, .. })));
+    let Err(ShrinkError::Genus { genus: 1, places }) = adaptive_curve(&ring, 100) else { panic!() };
+    assert!(places[0][0].hypot(places[0][1]) < 0.45, "in the hole: {places:?}");
     let none = json!({"intersection": {"of": [disc(0.3, [-0.5, 0.0]), disc(0.2, [0.5, 0.0])]}});
     let Err(ShrinkError::Empty { min, max }) = adaptive_curve(&none, 100) else { panic!() };
     assert!(min > 0.0 && max > min);
     let ball = json!({"sphere": {"radius": 0.5}});
-    assert_eq!(adaptive_curve(&ball, 100), Err(ShrinkError::Dimension { found: 3, wanted: 2 }));
+    assert_eq!(adaptive_curve(&ball, 100).unwrap_err(), ShrinkError::Dimension { found: 3, wanted: 2 });
 }
 
 #[test]
-fn a_shape_smaller_than_a_cell_of_the_first_lattice_is_found() {
-    let curve = adaptive_curve(&disc(0.012, [0.331, 0.207]), 60).unwrap();
-    assert!(curve.report.simple && (curve.report.length - std::f64::consts::TAU * 0.012).abs() < 1e-4);
+fn one_component_of_several_is_had_by_asking_for_it() {
+    let scene = json!({"union": {"of": [disc(0.2, [-0.5, 0.0]), disc(0.3, [0.5, 0.0]), disc(0.1, [0.0, 0.6])]}});
+    let scene = Scene::from_value(&scene).unwrap();
+    for (component, middle, radius) in [
+        (Component::Largest, [0.5, 0.0], 0.3),
+        (Component::Index(1), [-0.5, 0.0], 0.2),
+        (Component::Index(2), [0.0, 0.6], 0.1),
+    ] {
+        let spec = CurveSpec { component: Some(component), ..CurveSpec::default() };
+        let (curve, report) = shrunk(&scene, &spec, 1).unwrap();
+        assert!(report.verdict.passed, "{component:?}: {report:?}");
+        assert_eq!(curve.left_out, LeftOut { components: 2, ..LeftOut::default() });
+        for p in &curve.positions {
+            assert!(((p[0] - middle[0]).hypot(p[1] - middle[1]) - radius).abs() < 1e-6, "{component:?}: {p:?}");
+        }
+    }
+    let spec = CurveSpec { component: Some(Component::Index(3)), ..CurveSpec::default() };
+    assert!(matches!(shrunk(&scene, &spec, 1), Err(ShrinkError::NoComponent { index: 3, count: 3, .. })));
 }
 
 #[test]
-fn a_gap_of_a_few_cells_of_the_last_lattice_stays_open() {
-    // a slit 0.02 wide and 1 deep
-    let slit = json!({"difference": {"of": [
-        {"rectangle": {"half_extents": [0.6, 0.6]}},
-        {"translate": {"by": [0.0, 0.1], "of": {"rectangle": {"half_extents": [0.01, 0.5]}}}},
-        {"translate": {"by": [0.0, 0.6], "of": {"rectangle": {"half_extents": [0.01, 0.2]}}}}
-    ]}});
-    let curve = adaptive_curve(&slit, 300).unwrap();
-    assert!(curve.report.simple && curve.report.corners == 8, "{:?}", curve.report);
-    // the square's 4.8, and the two walls of the slit; its floor is what its mouth takes away
-    assert!((curve.report.length - 6.8).abs() < 1e-5, "{}", curve.report.length);
+fn a_wrap_goes_around_the_holes_and_says_so() {
+    let holed = difference(&[rectangle([0.6, 0.5], [0.0, 0.0]), disc(0.2, [-0.3, 0.0]), disc(0.1, [0.3, 0.2])]);
+    let scene = Scene::from_value(&holed).unwrap();
+    let spec = CurveSpec { on_topology: OnTopology::Wrap, ..CurveSpec::default() };
+    let (curve, report) = shrunk(&scene, &spec, 1).unwrap();
+    assert!(report.verdict.passed, "{report:?}");
+    assert_eq!((curve.left_out.holes, curve.left_out.components, report.corners), (2, 0, 4));
+    assert!((curve.left_out.hole_area - std::f64::consts::PI * 0.05).abs() < 1e-3, "{:?}", curve.left_out);
+    assert!((report.arc_length.length - 4.4).abs() < 1e-5, "{report:?}");
+}
+
+#[test]
+fn a_shape_smaller_than_a_cell_of_the_first_mesh_is_found() {
+    let (_, report) = sound(&disc(0.012, [0.331, 0.207]), 60);
+    assert!((report.arc_length.length - TAU * 0.012).abs() < 1e-4);
+}
+
+#[test]
+fn a_slit_far_thinner_than_any_triangle_of_the_first_mesh_stays_open() {
+    // widths of 1/100 to 1/3000 of the square; the walls are too near for anything but straight edges between corners
+    for width in [0.01, 0.001, 0.0004] {
+        let slit = difference(&[rectangle([0.6, 0.6], [0.0, 0.0]), rectangle([0.5 * width, 0.5], [0.0313, 0.2])]);
+        let (curve, report) = sound(&slit, 300);
+        assert_eq!(report.corners, 8, "{width}: {report:?}");
+        // the square's 4.8, and the two walls of the slit; its floor is what its mouth takes away
+        assert!((report.arc_length.length - 6.6).abs() < 1e-4, "{width}: {}", report.arc_length.length);
+        assert_eq!(curve.left_out, LeftOut::default());
+    }
+}
+
+#[test]
+fn a_strut_that_joins_two_discs_is_followed_and_never_cut() {
+    for width in [0.01, 0.001] {
+        let parts = [disc(0.2, [-0.7, 0.0]), disc(0.2, [0.7, 0.0]), rectangle([0.7, 0.5 * width], [0.0, 0.0])];
+        let (_, report) = sound(&json!({"union": {"of": parts}}), 400);
+        assert_eq!(report.corners, 4, "{width}: {report:?}");
+    }
+}
+
+#[test]
+fn from_sixteen_samples_to_a_hundred_thousand() {
+    for (samples, distance) in [(16, 8e-3), (1000, 2e-6), (100_000, 5e-7)] {
+        let (curve, report) = sound(&disc(0.5, [0.0, 0.0]), samples);
+        assert_eq!(curve.positions.len(), samples as usize);
+        assert!(report.distance.max < distance, "{samples}: {report:?}");
+    }
+    for (asked, got) in [(0, 8), (200_000, 100_000)] {
+        assert_eq!(adaptive_curve(&disc(0.5, [0.0, 0.0]), asked).unwrap().0.positions.len(), got);
+    }
 }
 
 #[test]
 fn the_paper_reaches_a_disc_and_never_the_inside_of_a_letter() {
-    let spec = CurveSpec { method: Method::Paper, samples: 400 };
-    let round = shrunk(&example("disc"), &spec, 1).unwrap();
-    assert!(round.report.simple && round.report.from_zero_set.max < 1e-4);
-    let letter = shrunk(&example("letter_s"), &spec, 1).unwrap();
-    let adaptive = shrunk(&example("letter_s"), &CurveSpec::default(), 1).unwrap();
-    assert!(letter.report.from_zero_set.max > 100.0 * adaptive.report.from_zero_set.max, "{:?}", letter.report);
+    let spec = CurveSpec { method: Method::Paper, ..CurveSpec::default() };
+    let (_, round) = shrunk(&example("disc"), &spec, 1).unwrap();
+    assert!(round.simple && round.distance.max < 1e-4, "{round:?}");
+    let (_, letter) = shrunk(&example("letter_s"), &spec, 1).unwrap();
+    let (_, adaptive) = shrunk(&example("letter_s"), &CurveSpec::default(), 1).unwrap();
+    let missed = |r: &CurveReport| r.distance.truth_to_surface.max;
+    assert!(missed(&letter) > 100.0 * missed(&adaptive) && !letter.verdict.passed, "{letter:?}");
 }
 
 #[test]
 fn any_number_of_threads_gives_the_same_curve() {
     for method in [Method::Adaptive, Method::Paper] {
-        let spec = CurveSpec { method, samples: 700 };
+        let spec = CurveSpec { method, samples: 700, ..CurveSpec::default() };
         assert_eq!(shrunk(&example("letter_g"), &spec, 1), shrunk(&example("letter_g"), &spec, 5));
     }
 }
@@ -133,14 +247,8 @@ fn a_raised_token_ends_the_run() {
     cancel.cancel();
     let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_| {} };
     let scene = example("disc");
-    let found = shrink_curve(&Sampler::new(&scene, settings, &tally), &CurveSpec::default());
+    let found = shrink_curve(&Sampler::new(&scene, settings, &tally), &CurveSpec::default(), &Effort::default());
     assert_eq!(found, Err(ShrinkError::Canceled(Canceled)));
-}
-
-#[test]
-fn numbers_of_samples_out_of_range_are_taken_to_the_nearest() {
-    assert_eq!(adaptive_curve(&disc(0.5, [0.0, 0.0]), 0).unwrap().positions.len(), 8);
-    assert_eq!(adaptive_curve(&disc(0.5, [0.0, 0.0]), 20_000).unwrap().positions.len(), 10_000);
 }
 
 /// A superellipse whose values are nothing like distances, in a domain that is neither square nor about the origin.
@@ -182,8 +290,8 @@ impl Field for Steep {
 
 #[test]
 fn values_that_are_no_distances_do_no_harm() {
-    let curve = shrunk(&Steep, &CurveSpec::default(), 1).unwrap();
-    assert!(curve.report.closed && curve.report.simple && curve.report.corners == 0, "{:?}", curve.report);
+    let (curve, report) = shrunk(&Steep, &CurveSpec::default(), 1).unwrap();
+    assert_eq!((report.verdict.passed, report.corners), (true, 0), "{report:?}");
     for p in &curve.positions {
         let (u, v) = ((p[0] - 5.0) / 2.0, (p[1] - 1.0) / 0.5);
         assert!((u.powi(4) + v.powi(4) - 0.5).abs() < 1e-4, "{p:?}");
