@@ -7,7 +7,7 @@
 //!
 //! Not guaranteed: that a handle narrower than the lattice is found; a finer study finds it.
 
-use super::contract::{Lattice, OBSTRUCTION, Resolution, carve, lattice, thin_walls};
+use super::contract::{Lattice, Resolution, carve, lattice, thin_walls};
 use super::grid3::{Grid3, NEIGHBOURS};
 use super::mend::{Label, Mended, Plug, Territory};
 use super::topology::{PLACES, clusters, euler, middle, neighbour};
@@ -22,6 +22,9 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 const LEVELS: u32 = 3;
 /// How much deeper than the first a study can go.
 pub const DEEPEST: u32 = 1;
+/// Nodes that could not be given up and are farther outside than this many spacings span a handle or a gap: one of about two
+/// spacings across. Half of what the contraction refuses, because who asks for a look wants to know.
+const OBSTRUCTION: f64 = 0.9;
 /// Half the thickness of a membrane, in spacings: more than the covering radius of the lattice, sqrt(3)/2, so that no gap
 /// is left between its nodes.
 const MEMBRANE: f64 = 1.0;
@@ -75,7 +78,7 @@ pub fn study<'a>(sampler: &Sampler<'a>, spec: &ShrinkSpec, depth: u32) -> Result
     for (i, _) in thin_walls(&sampler.framed(frame), &grid)? {
         values[i] = values[i].min(-f32::MIN_POSITIVE);
     }
-    // what could not be given up and is near is an unevenness below the lattice: it counts as solid, as in the contraction
+    // what could not be given up and is near is an unevenness below the lattice: it counts as solid
     let limit = (OBSTRUCTION * grid.h) as f32;
     let inside = carve(&grid, &values, cancel)?;
     let solid: Vec<bool> = (0..grid.len()).map(|i| inside[i] && values[i] <= limit).collect();
