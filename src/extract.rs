@@ -97,8 +97,8 @@ pub fn extract(
             break;
         }
         begins(Part::Shrink);
-        // what went wrong may be a handle narrower than the first look's lattice
-        if attempt > 0 && spec.on_topology == OnTopology::Wrap && depth < DEEPEST {
+        // what went wrong may be a handle or a gap narrower than the first look's lattice
+        if attempt > 0 && mended.is_some() && depth < DEEPEST {
             depth += 1;
             mended = study(sampler, spec, depth)?;
         }

@@ -28,7 +28,7 @@ const PROBE: f64 = 1.5;
 const SOLID: f64 = 0.45;
 /// Nodes that could not be given up and are farther outside than this many spacings are the membrane of a handle, the
 /// bridge to another component, or a void.
-pub(super) const OBSTRUCTION: f64 = 1.8;
+const OBSTRUCTION: f64 = 1.8;
 /// An obstruction that reaches farther outside than this many spacings is no matter of resolution.
 const CERTAIN: f64 = 6.0;
 
