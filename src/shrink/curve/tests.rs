@@ -50,7 +50,8 @@ fn rectangle(half_extents: [f64; 2], at: [f64; 2]) -> Value {
 
 /// A star polygon: `n` tips at radius 1, `n` notches at `inner`, times `size`.
 fn star(n: usize, inner: f64, size: f64) -> Vec<[f64; 2]> {
-    let at = |i: usize| (size * if i % 2 == 0 { 1.0 } else { inner }, std::f64::consts::PI * i as f64 / n as f64);
+    let at =
+        |i: usize| (size * if i.is_multiple_of(2) { 1.0 } else { inner }, std::f64::consts::PI * i as f64 / n as f64);
     (0..2 * n).map(at).map(|(r, a)| [r * a.cos(), r * a.sin()]).collect()
 }
 
