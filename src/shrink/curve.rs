@@ -232,7 +232,7 @@ fn chosen(mut loops: Vec<Loop>, spec: &CurveSpec, frame: Frame) -> Result<(Loop,
     let left_out = LeftOut {
         components: parts.len() as u64 - 1,
         holes: part.holes.len() as u64,
-        hole_area: part.holes.iter().map(area).sum(),
+        hole_area: part.holes.iter().map(area).fold(0.0, |sum, hole| sum + hole),
     };
     Ok((loops.swap_remove(part.outer), left_out))
 }

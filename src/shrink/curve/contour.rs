@@ -174,13 +174,13 @@ fn unaccounted(
     let mut ends = Ends { cells: Map::default(), reach: detail.coarsest };
     for (l, triangles) in loops {
         let n = l.points.len();
-        for k in 0..n {
+        for (k, &triangle) in triangles.iter().enumerate() {
             let turn = l.normals[k][1].dot(l.normals[(k + 1) % n][0]);
-            if turn < TURN_COSINE && fine(triangles[k]) {
-                wanted.push(triangles[k]);
+            if turn < TURN_COSINE && fine(triangle) {
+                wanted.push(triangle);
             }
             if turn < BACK_COSINE {
-                ends.add(l.points[k], size(triangles[k]));
+                ends.add(l.points[k], size(triangle));
             }
         }
     }

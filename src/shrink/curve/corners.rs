@@ -58,11 +58,11 @@ pub(super) fn with_corners(
         let n = path.len();
         let meets = |k: usize, l: usize| Candidate::new(&path[k % n], &path[l % n]);
         let mut list = Vec::new();
-        for k in 0..n {
+        for (k, step) in path.iter().enumerate() {
             let around = || {
                 let hidden = meets(k + n - 1, k).is_none();
                 let candidate = hidden.then(|| meets(k + n - 1, k + 1)).flatten()?;
-                let on_top = candidate.place.distance(path[k].1.point) < BESIDE * size(path[k].2);
+                let on_top = candidate.place.distance(step.1.point) < BESIDE * size(step.2);
                 on_top.then_some((candidate, [(k + n - 1) % n, (k + 1) % n]))
             };
             let direct = meets(k, k + 1).map(|c| (c, [k, (k + 1) % n]));

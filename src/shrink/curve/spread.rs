@@ -211,9 +211,9 @@ fn settle(sampler: &Sampler<'_>, samples: &mut Samples) -> Result<(), ShrinkErro
             }
         }
     }
-    for i in 0..s.len() {
-        if !samples.corners[i] {
-            samples.normals[i] = g[i].truncate().normalize_or(samples.normals[i]);
+    for ((normal, gradient), corner) in samples.normals.iter_mut().zip(&g).zip(&samples.corners) {
+        if !corner {
+            *normal = gradient.truncate().normalize_or(*normal);
         }
     }
     samples.slopes = g.iter().map(|g| g.length()).collect();

@@ -189,9 +189,9 @@ mod tests {
         assert_eq!(picture.dimensions(), (200, 200));
         assert_eq!(picture.get_pixel(0, 0).0, [255; 3]);
         assert_eq!(picture.get_pixel(100, 110).0, SOLID.map(to_srgb));
-        // parameter 1/4 is at the top, where the colour is between yellow and green
-        let [r, g, b] = picture.get_pixel(100, 58).0;
-        assert!(g > 200 && r > 80 && r < 200 && b < 60, "{r} {g} {b}");
+        // parameter 1/8 is halfway to the top, where the colour is between red and yellow-green
+        let [r, g, b] = picture.get_pixel(142, 79).0;
+        assert!(r > 200 && g > 130 && g < 235 && b < 60, "{r} {g} {b}");
         // parameter 0 is at the right
         let [r, g, b] = picture.get_pixel(184 + 5, 100).0;
         assert!(r > 200 && g < 60 && b < 60, "{r} {g} {b}");
