@@ -1,6 +1,6 @@
 //! Steps onto the zero level set that can be trusted on fields that are not distances.
 
-use crate::field::Sampler;
+use crate::field::{Metric, Sampler};
 use crate::settings::Canceled;
 use glam::DVec3;
 
@@ -24,12 +24,25 @@ pub struct OnZero {
     pub gradients: Vec<DVec3>,
 }
 
-/// Takes `positions` to the zero level set: Newton steps for those whose distance is above `tolerance`. A step is at most `reach`; one that does not bring the value down is halved instead of taken.
+/// Takes `positions` to the zero level set: Newton steps for those whose distance is above `tolerance`. A step is at most
+/// `reach`; one that does not bring the value down is halved instead of taken. Where values are distances a short step
+/// ends in the closest point, where the gradient is the same, and the field is not asked again.
 pub fn project(sampler: &Sampler<'_>, positions: Vec<DVec3>, reach: f64, tolerance: f64) -> Result<OnZero, Canceled> {
     /// Steps at most.
     const STEPS: usize = 5;
+    /// A step of at most this share of the reach is short.
+    const SHORT: f64 = 0.1;
     let mut at = positions;
     let (mut values, mut gradients) = sampler.gradients(&at)?;
+    if sampler.field().metric() == Metric::Exact {
+        for i in 0..at.len() {
+            let unit = (gradients[i].length() - 1.0).abs() < 1e-3;
+            if unit && values[i].abs() <= SHORT * reach {
+                at[i] -= values[i] * gradients[i];
+                values[i] = 0.0;
+            }
+        }
+    }
     let mut active: Vec<u32> = (0..at.len() as u32).collect();
     let mut fraction = vec![1.0f64; at.len()];
     for _ in 0..STEPS {
