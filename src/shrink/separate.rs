@@ -4,9 +4,11 @@
 //! chords of the lattice, being apart comes before being exactly on the zero level set.
 
 use super::Wrap;
+use super::base::mix_targets;
 use super::collide::{Bounds, Index, crossings, meet, overlap};
+use super::energy::Reference;
 use super::lattice::SphereLattice;
-use super::unfold::{Corners, grow, smooth};
+use super::unfold::{Corners, Problem, grow, relax, smooth};
 use super::untangle::{FOLD, Random, Tangle, masked};
 use super::zero::{OnZero, step_to_zero};
 use crate::field::Sampler;
@@ -93,7 +95,7 @@ pub fn separate(
 ) -> Result<Faults, Canceled> {
     /// Rounds of a cycle, which starts with smoothing what is bad, from the second cycle on.
     const CYCLE: usize = 3;
-    const CYCLES: usize = 5;
+    const CYCLES: usize = 6;
     /// One in so many vertices is moved at most, counting every move; a surface that needs more is past repair.
     const SHARE: usize = 6;
     /// Moves that even the smallest lattice has.
@@ -387,8 +389,12 @@ impl Repair<'_> {
     /// Smooths what is bad and some rings around it, and takes it back to the zero level set.
     fn loosen(&mut self, mask: &mut [bool], rings: usize) -> Result<(), Canceled> {
         grow(mask, &self.state.triangles, rings - 1);
-        for _ in 0..rings + 1 {
-            smooth(&mut self.state.at.positions, &self.state.triangles, &self.corners, mask, 0.5);
+        if rings.is_multiple_of(2) {
+            self.unfold(mask);
+        } else {
+            for _ in 0..rings + 1 {
+                smooth(&mut self.state.at.positions, &self.state.triangles, &self.corners, mask, 0.5);
+            }
         }
         let moved = masked(mask);
         let points: Vec<DVec3> = moved.iter().map(|&v| self.state.at.positions[v as usize]).collect();
@@ -407,6 +413,26 @@ impl Repair<'_> {
         self.judge(&stars)?;
         self.note(&stars);
         Ok(())
+    }
+
+    /// Relaxes what a mask holds towards equilateral triangles that face along the field's normals.
+    fn unfold(&mut self, mask: &[bool]) {
+        let active = masked(mask);
+        let edge = active.iter().map(|&v| self.edge(v)).sum::<f64>() / active.len().max(1) as f64;
+        let State { at, triangles, targets, .. } = &mut self.state;
+        let normals: Vec<DVec3> = at.gradients.iter().map(|g| g.normalize_or(DVec3::Z)).collect();
+        let mut wanted = targets.clone();
+        mix_targets(&mut wanted, triangles, mask, &normals);
+        let problem = Problem {
+            triangles,
+            corners: &self.corners,
+            reference: &|_, _| Reference::equilateral(edge),
+            targets: &wanted,
+            normals: &normals,
+            anchors: None,
+            epsilon: 0.1,
+        };
+        relax(&problem, &mut at.positions, &active, 4);
     }
 
     /// Mean length of the edges around a vertex.
@@ -619,9 +645,9 @@ mod tests {
             }
         }
         fn gradients(&self, p: Points<'_>, values: &mut [f32], g: Gradients<'_>) {
-            for i in 0..values.len() {
+            for (i, value) in values.iter_mut().enumerate() {
                 let (s, n) = Self::at(DVec3::new(p.x[i].into(), p.y[i].into(), p.z[i].into()));
-                (values[i], g.x[i], g.y[i], g.z[i]) = (s as f32, n.x as f32, n.y as f32, n.z as f32);
+                (*value, g.x[i], g.y[i], g.z[i]) = (s as f32, n.x as f32, n.y as f32, n.z as f32);
             }
         }
     }
