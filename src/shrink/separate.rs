@@ -617,8 +617,7 @@ mod tests {
     use crate::settings::{CancelToken, Settings};
     use crate::shrink::lattice::LatticeSpec;
 
-    /// The plate between two concentric spheres around a far centre: nearly flat, `THICK` thick, |x|, |y| unbounded.
-    /// Closed to a body by cutting with the unit ball.
+    /// A round plate of radius 1 and thickness `THICK` in the plane z = 0, far thinner than the lattice's edges.
     struct Plate;
     const THICK: f64 = 0.02;
 
