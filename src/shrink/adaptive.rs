@@ -96,16 +96,14 @@ fn one(
     let edge = (mesh.area() / lattice.directions.len() as f64).sqrt();
     let mut at = project(&sampler, landed.clone(), &normals, edge, 1e-3 * edge)?;
     stage("untangle", 0.85, None, None, None);
-    let diagonals = choose_diagonals(&sampler, lattice, &at)?;
+    let mut diagonals = vec![false; lattice.quads.len()];
+    choose_diagonals(&sampler, lattice, &at, &mut diagonals, |_| true)?;
     let triangles = lattice.triangles(&diagonals);
     let tangle = Tangle::new(&sampler, &triangles, &at.positions);
-    let mut folds = tangle.relax_patches(&mut at, &landed, 2)?;
-    if folds > 0 {
-        folds = tangle.move_single(&mut at)?;
-    }
-    stage("sharpen", 0.95, Some(show(&at.positions, triangles.clone())), None, Some(folds as u64));
+    let folds = tangle.relax_patches(&mut at, &landed, 2)?;
+    stage("sharpen", 0.95, Some(show(&at.positions, triangles)), None, Some(folds as u64));
     let blunt = at.positions.clone();
-    let (folds, at, diagonals) = sharpen(&sampler, lattice, (folds, at, diagonals))?;
+    let diagonals = sharpen(&sampler, lattice, &mut at, diagonals)?;
     let triangles = lattice.triangles(&diagonals);
     stage("separate", 0.97, Some(show(&at.positions, triangles)), None, Some(folds as u64));
     let to_scene = |list: &[DVec3]| -> Vec<DVec3> { list.iter().map(|&p| frame.to_scene(p)).collect() };
@@ -121,24 +119,20 @@ fn one(
     Ok(wrap)
 }
 
-/// Moves vertices onto creases and turns diagonals along them; keeps what it was given where that folds more.
+/// Moves vertices onto creases and turns diagonals along them. What that folds or lets cross is repaired later.
 fn sharpen(
     sampler: &Sampler<'_>,
     lattice: &SphereLattice,
-    before: (usize, OnZero, Vec<bool>),
-) -> Result<(usize, OnZero, Vec<bool>), ShrinkError> {
-    let mut at = before.1.clone();
-    let triangles = lattice.triangles(&before.2);
-    let corners = Corners::new(at.positions.len(), &triangles);
-    if snap(sampler, &triangles, &corners, &mut at)? == 0 {
-        return Ok(before);
-    }
-    let diagonals = choose_diagonals(sampler, lattice, &at)?;
+    at: &mut OnZero,
+    mut diagonals: Vec<bool>,
+) -> Result<Vec<bool>, ShrinkError> {
     let triangles = lattice.triangles(&diagonals);
-    let tangle = Tangle::new(sampler, &triangles, &at.positions);
-    let mut folds = tangle.folds(&at)?;
-    if folds > before.0 {
-        folds = tangle.move_single(&mut at)?;
+    let corners = Corners::new(at.positions.len(), &triangles);
+    let moved = snap(sampler, &triangles, &corners, at)?;
+    let mut mask = vec![false; at.positions.len()];
+    for v in moved {
+        mask[v as usize] = true;
     }
-    Ok(if folds > before.0 { before } else { (folds, at, diagonals) })
+    choose_diagonals(sampler, lattice, at, &mut diagonals, |v| mask[v])?;
+    Ok(diagonals)
 }

@@ -174,9 +174,9 @@ pub fn crossings(
 pub fn meet(positions: &[DVec3], s: [u32; 3], t: [u32; 3]) -> bool {
     let mut shared = [(0, 0); 3];
     let mut count = 0;
-    for i in 0..3 {
-        for j in 0..3 {
-            if s[i] == t[j] {
+    for (i, v) in s.iter().enumerate() {
+        for (j, w) in t.iter().enumerate() {
+            if v == w {
                 shared[count] = (i, j);
                 count += 1;
             }

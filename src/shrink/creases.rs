@@ -27,13 +27,13 @@ struct Candidate {
     distance: f64,
 }
 
-/// Moves vertices near creases and corners onto them. Returns how many moved.
+/// Moves vertices near creases and corners onto them. Returns which moved.
 pub fn snap(
     sampler: &Sampler<'_>,
     triangles: &[[u32; 3]],
     corners: &Corners,
     at: &mut OnZero,
-) -> Result<usize, Canceled> {
+) -> Result<Vec<u32>, Canceled> {
     let normals: Vec<DVec3> = at.gradients.iter().map(|g| g.normalize_or_zero()).collect();
     let found = candidates(triangles, corners, &at.positions, &normals);
     let places: Vec<DVec3> = found.iter().map(|c| c.to).collect();
@@ -56,7 +56,7 @@ pub fn snap(
     for (k, &v) in moved.iter().enumerate() {
         (at.values[v as usize], at.gradients[v as usize]) = (values[k], gradients[k]);
     }
-    Ok(moved.len())
+    Ok(moved)
 }
 
 /// Places that vertices could go to.
@@ -177,16 +177,25 @@ fn keeps_shape(
     })
 }
 
-/// For every quad whether its other diagonal is better: the one that runs closer to the zero level set where the normals
-/// around differ, the one that agrees with them elsewhere.
-pub fn choose_diagonals(sampler: &Sampler<'_>, lattice: &SphereLattice, at: &OnZero) -> Result<Vec<bool>, Canceled> {
+/// Chooses the diagonals of the quads that have a corner for which `changed` holds: the one that runs closer to the zero
+/// level set where the normals around differ, the one that agrees with them elsewhere.
+pub fn choose_diagonals(
+    sampler: &Sampler<'_>,
+    lattice: &SphereLattice,
+    at: &OnZero,
+    choice: &mut [bool],
+    changed: impl Fn(usize) -> bool,
+) -> Result<(), Canceled> {
     /// Quads whose normals agree at least this well keep the regular pattern.
     const EVEN: f64 = 0.97;
     let normals: Vec<DVec3> = at.gradients.iter().map(|g| g.normalize_or_zero()).collect();
-    let mut choice = vec![false; lattice.quads.len()];
     let (mut asked, mut middles) = (Vec::new(), Vec::new());
     for (i, quad) in lattice.quads.iter().enumerate() {
         let k = quad.map(|c| lattice.chart[c as usize] as usize);
+        if !k.iter().any(|&v| changed(v)) {
+            continue;
+        }
+        choice[i] = false;
         let mean = k.iter().map(|&v| normals[v]).sum::<DVec3>().normalize_or_zero();
         let p = k.map(|v| at.positions[v]);
         let flat = k.iter().all(|&v| normals[v].dot(mean) > EVEN);
@@ -215,5 +224,5 @@ pub fn choose_diagonals(sampler: &Sampler<'_>, lattice: &SphereLattice, at: &OnZ
         let other = cost([[0, 1, 3], [1, 2, 3]], values[2 * n + 1]);
         choice[i] = other < first - 1e-3;
     }
-    Ok(choice)
+    Ok(())
 }

@@ -4,9 +4,11 @@
 //! chords of the lattice, being apart comes before being exactly on the zero level set.
 
 use super::Wrap;
+use super::base::mix_targets;
 use super::collide::{Bounds, Index, crossings, meet, overlap};
+use super::energy::Reference;
 use super::lattice::SphereLattice;
-use super::unfold::{Corners, grow, smooth};
+use super::unfold::{Corners, Problem, grow, relax, smooth};
 use super::untangle::{FOLD, Random, Tangle, masked};
 use super::zero::{OnZero, step_to_zero};
 use crate::field::Sampler;
@@ -93,7 +95,7 @@ pub fn separate(
 ) -> Result<Faults, Canceled> {
     /// Rounds of a cycle, which starts with smoothing what is bad, from the second cycle on.
     const CYCLE: usize = 3;
-    const CYCLES: usize = 5;
+    const CYCLES: usize = 6;
     /// One in so many vertices is moved at most, counting every move; a surface that needs more is past repair.
     const SHARE: usize = 6;
     /// Moves that even the smallest lattice has.
@@ -387,8 +389,12 @@ impl Repair<'_> {
     /// Smooths what is bad and some rings around it, and takes it back to the zero level set.
     fn loosen(&mut self, mask: &mut [bool], rings: usize) -> Result<(), Canceled> {
         grow(mask, &self.state.triangles, rings - 1);
-        for _ in 0..rings + 1 {
-            smooth(&mut self.state.at.positions, &self.state.triangles, &self.corners, mask, 0.5);
+        if rings.is_multiple_of(2) {
+            self.unfold(mask);
+        } else {
+            for _ in 0..rings + 1 {
+                smooth(&mut self.state.at.positions, &self.state.triangles, &self.corners, mask, 0.5);
+            }
         }
         let moved = masked(mask);
         let points: Vec<DVec3> = moved.iter().map(|&v| self.state.at.positions[v as usize]).collect();
@@ -407,6 +413,26 @@ impl Repair<'_> {
         self.judge(&stars)?;
         self.note(&stars);
         Ok(())
+    }
+
+    /// Relaxes what a mask holds towards equilateral triangles that face along the field's normals.
+    fn unfold(&mut self, mask: &[bool]) {
+        let active = masked(mask);
+        let edge = active.iter().map(|&v| self.edge(v)).sum::<f64>() / active.len().max(1) as f64;
+        let State { at, triangles, targets, .. } = &mut self.state;
+        let normals: Vec<DVec3> = at.gradients.iter().map(|g| g.normalize_or(DVec3::Z)).collect();
+        let mut wanted = targets.clone();
+        mix_targets(&mut wanted, triangles, mask, &normals);
+        let problem = Problem {
+            triangles,
+            corners: &self.corners,
+            reference: &|_, _| Reference::equilateral(edge),
+            targets: &wanted,
+            normals: &normals,
+            anchors: None,
+            epsilon: 0.1,
+        };
+        relax(&problem, &mut at.positions, &active, 4);
     }
 
     /// Mean length of the edges around a vertex.
@@ -584,117 +610,4 @@ fn thinness(k: [DVec3; 3]) -> f64 {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::field::sampler::Tally;
-    use crate::field::{Domain, Field, Gradients, Metric, Points};
-    use crate::settings::{CancelToken, Settings};
-    use crate::shrink::lattice::LatticeSpec;
-
-    /// The plate between two concentric spheres around a far centre: nearly flat, `THICK` thick, |x|, |y| unbounded.
-    /// Closed to a body by cutting with the unit ball.
-    struct Plate;
-    const THICK: f64 = 0.02;
-
-    impl Plate {
-        fn at(p: DVec3) -> (f64, DVec3) {
-            let (ball, plate) = (p.length() - 1.0, p.z.abs() - 0.5 * THICK);
-            if plate >= ball { (plate, DVec3::new(0.0, 0.0, p.z.signum())) } else { (ball, p.normalize_or(DVec3::X)) }
-        }
-    }
-
-    impl Field for Plate {
-        fn domain(&self) -> Domain {
-            Domain { min: [-1.5; 3], max: [1.5; 3] }
-        }
-        fn metric(&self) -> Metric {
-            Metric::Bound
-        }
-        fn lipschitz(&self) -> Option<f32> {
-            Some(1.0)
-        }
-        fn values(&self, p: Points<'_>, values: &mut [f32]) {
-            for (i, v) in values.iter_mut().enumerate() {
-                *v = Self::at(DVec3::new(p.x[i].into(), p.y[i].into(), p.z[i].into())).0 as f32;
-            }
-        }
-        fn gradients(&self, p: Points<'_>, values: &mut [f32], g: Gradients<'_>) {
-            for i in 0..values.len() {
-                let (s, n) = Self::at(DVec3::new(p.x[i].into(), p.y[i].into(), p.z[i].into()));
-                (values[i], g.x[i], g.y[i], g.z[i]) = (s as f32, n.x as f32, n.y as f32, n.z as f32);
-            }
-        }
-    }
-
-    fn with_sampler<R>(threads: usize, work: impl FnOnce(&Sampler<'_>) -> R) -> R {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let cancel = CancelToken::new();
-        let tally = Tally::new();
-        work(&Sampler::new(&Plate, Settings { pool: &pool, cancel: &cancel, progress: &|_| {} }, &tally))
-    }
-
-    /// The upper and lower halves of a sphere lattice pressed onto the plate's two faces.
-    fn pressed(sampler: &Sampler<'_>) -> Wrap {
-        let lattice = SphereLattice::new(LatticeSpec::Octahedral { n: 16 });
-        let positions: Vec<DVec3> = lattice
-            .directions
-            .iter()
-            .map(|d| {
-                let flat = DVec3::new(d.x, d.y, 0.0);
-                // equal areas: the disc's radius grows like the chord to the pole
-                let radius = (1.0 - d.z.abs()).sqrt() * (1.0 - 1e-3);
-                flat.normalize_or_zero() * radius + DVec3::Z * (0.5 * THICK).min(d.z.abs()).copysign(d.z)
-            })
-            .collect();
-        let (values, gradients) = sampler.gradients(&positions).unwrap();
-        let diagonals = vec![false; lattice.quads.len()];
-        Wrap { lattice, positions, values, gradients, diagonals }
-    }
-
-    fn crossing(sampler: &Sampler<'_>, wrap: &Wrap) -> usize {
-        let triangles = wrap.lattice.triangles(&wrap.diagonals);
-        let all: Vec<u32> = (0..triangles.len() as u32).collect();
-        crossings(&Index::new(&wrap.positions, &triangles), &wrap.positions, &triangles, &all, sampler.settings())
-            .unwrap()
-            .len()
-    }
-
-    #[test]
-    fn sheets_that_went_through_a_thin_wall_come_apart_and_stay_near_it() {
-        let repaired = [1, 2].map(|threads| {
-            with_sampler(threads, |sampler| {
-                let mut wrap = pressed(sampler);
-                assert_eq!(crossing(sampler, &wrap), 0);
-                // three places of the upper sheet are pushed through the lower one, as a Newton step past the middle does
-                let up: Vec<usize> = (0..wrap.positions.len())
-                    .filter(|&v| wrap.positions[v].z > 0.0 && wrap.positions[v].truncate().length() < 0.7)
-                    .step_by(97)
-                    .take(3)
-                    .collect();
-                for v in up {
-                    wrap.positions[v].z = -1.3 * THICK;
-                }
-                assert!(crossing(sampler, &wrap) > 10);
-                let left = separate(sampler, &mut wrap, &[], &[]).unwrap();
-                assert_eq!(left, Faults::default());
-                assert_eq!(crossing(sampler, &wrap), 0);
-                let limit = OFF * 8f64.sqrt();
-                assert!(wrap.values.iter().all(|s| s.abs() < limit));
-                wrap
-            })
-        });
-        assert_eq!(repaired[0].positions, repaired[1].positions, "one thread or two");
-    }
-
-    #[test]
-    fn a_fold_is_smoothed_out() {
-        with_sampler(1, |sampler| {
-            let mut wrap = pressed(sampler);
-            let v =
-                (0..wrap.positions.len()).find(|&v| wrap.positions[v].z > 0.0 && wrap.positions[v].x > 0.3).unwrap();
-            wrap.positions[v].x += 0.2;
-            let left = separate(sampler, &mut wrap, &[], &[]).unwrap();
-            assert_eq!((left, crossing(sampler, &wrap)), (Faults::default(), 0));
-        });
-    }
-}
+mod tests;

@@ -1,5 +1,4 @@
-//! Takes the last folds out of a lattice on the zero level set: first by relaxing patches around them, then by moving
-//! single vertices.
+//! Takes folds out of a lattice on the zero level set by relaxing patches around them.
 
 use super::energy::Reference;
 use super::unfold::{Corners, Problem, grow, mix_targets, relax, smooth};
@@ -59,11 +58,6 @@ impl<'a> Tangle<'a> {
             along[i] = normal(&at.positions, self.triangles[i]).normalize_or_zero().dot(targets[i]);
         }
         Ok((along, targets))
-    }
-
-    /// Number of folded triangles.
-    pub fn folds(&self, at: &OnZero) -> Result<usize, Canceled> {
-        Ok(self.agreement(at)?.0.iter().filter(|&&a| a <= FOLD).count())
     }
 
     /// Relaxes patches around doubtful triangles against the triangles of `landed`, the lattice before it was projected,
@@ -137,88 +131,6 @@ impl<'a> Tangle<'a> {
         let (values, gradients) = self.sampler.gradients(&points)?;
         for (k, &v) in moved.iter().enumerate() {
             (at.values[v as usize], at.gradients[v as usize]) = (values[k], gradients[k]);
-        }
-        Ok(())
-    }
-
-    /// Moves single vertices of folded triangles to the best of a few dozen places around them. Returns how many folded
-    /// triangles are left.
-    pub fn move_single(&self, at: &mut OnZero) -> Result<usize, Canceled> {
-        const ROUNDS: usize = 8;
-        /// Beyond this many folds single moves are hopeless.
-        const HOPELESS: usize = 150;
-        let (mut along, _) = self.agreement(at)?;
-        let mut random = Random::new();
-        for round in 0..ROUNDS {
-            let folded: Vec<usize> = (0..along.len()).filter(|&i| along[i] <= FOLD).collect();
-            if folded.is_empty() || folded.len() > HOPELESS {
-                break;
-            }
-            let mut mask = vec![false; at.positions.len()];
-            for &i in &folded {
-                for &v in &self.triangles[i] {
-                    mask[v as usize] = true;
-                }
-            }
-            if round % 2 == 1 {
-                grow(&mut mask, self.triangles, 1);
-            }
-            for v in masked(&mask) {
-                self.move_vertex(at, v, &mut along, &mut random)?;
-            }
-        }
-        // what was judged one by one is judged once more together
-        self.folds(at)
-    }
-
-    fn move_vertex(&self, at: &mut OnZero, v: u32, along: &mut [f64], random: &mut Random) -> Result<(), Canceled> {
-        const RANDOM_PLACES: usize = 24;
-        let list: Vec<usize> = self.corners.at(v).iter().map(|&c| c as usize / 3).collect();
-        let mut neighbours: Vec<u32> = list.iter().flat_map(|&t| self.triangles[t]).filter(|&u| u != v).collect();
-        neighbours.sort_unstable();
-        neighbours.dedup();
-        let here = at.positions[v as usize];
-        let around: Vec<DVec3> = neighbours.iter().map(|&u| at.positions[u as usize]).collect();
-        let edge = around.iter().map(|p| p.distance(here)).sum::<f64>() / around.len() as f64;
-        let center = around.iter().sum::<DVec3>() / around.len() as f64;
-        let mut places = vec![here];
-        places.extend([0.3, 0.6, 1.0].map(|t| here.lerp(center, t)));
-        places.extend(around.iter().map(|&p| here.midpoint(p)));
-        for _ in 0..RANDOM_PLACES {
-            let reach = [0.15, 0.4, 0.8][random.below(3)] * edge;
-            places.push(here + reach * random.normal());
-        }
-        let (mut values, mut gradients) = self.sampler.gradients(&places)?;
-        for _ in 0..2 {
-            for k in 1..places.len() {
-                places[k] += step_to_zero(values[k], gradients[k], edge);
-            }
-            (values, gradients) = self.sampler.gradients(&places)?;
-        }
-        let triangle =
-            |t: usize, to: DVec3| self.triangles[t].map(|u| if u == v { to } else { at.positions[u as usize] });
-        let corners: Vec<[DVec3; 3]> =
-            places.iter().flat_map(|&to| list.iter().map(move |&t| (t, to))).map(|(t, to)| triangle(t, to)).collect();
-        let centroids: Vec<DVec3> = corners.iter().map(|k| (k[0] + k[1] + k[2]) / 3.0).collect();
-        let (_, targets) = self.sampler.gradients(&centroids)?;
-        let agreements: Vec<f64> = corners
-            .iter()
-            .zip(&targets)
-            .map(|(k, g)| (k[1] - k[0]).cross(k[2] - k[0]).normalize_or_zero().dot(g.normalize_or_zero()))
-            .collect();
-        let cost = |k: usize| {
-            let these = &agreements[k * list.len()..(k + 1) * list.len()];
-            let folds: f64 = these.iter().map(|&a| if a <= 0.02 { 10.0 } else { 0.0 } + (0.15 - a).max(0.0)).sum();
-            folds + 1e-3 * places[k].distance(here) / edge + values[k].abs() / edge
-        };
-        let (best, least) =
-            (0..places.len()).map(|k| (k, cost(k))).min_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or((0, 0.0));
-        if best > 0 && least < cost(0) - 1e-9 {
-            let v = v as usize;
-            (at.positions[v], at.values[v], at.gradients[v]) = (places[best], values[best], gradients[best]);
-            for (k, &t) in list.iter().enumerate() {
-                along[t] = agreements[best * list.len() + k];
-            }
         }
         Ok(())
     }

@@ -1,6 +1,6 @@
 //! Steps onto the zero level set that can be trusted on fields that are not distances.
 
-use crate::field::Sampler;
+use crate::field::{Metric, Sampler};
 use crate::settings::Canceled;
 use glam::DVec3;
 
@@ -79,7 +79,8 @@ pub struct OnZero {
 
 /// Takes `positions` with the outward `normals` of the surface that they are on to the zero level set: Newton steps for
 /// those whose distance is above `tolerance`. A step is at most `reach`; one that does not bring the value down is halved
-/// instead of taken. Points whose gradient belongs to another sheet go to their own, or stay where they are.
+/// instead of taken. Points whose gradient belongs to another sheet go to their own, or stay where they are. Where values
+/// are distances a short step ends in the closest point, where the gradient is the same, and the field is not asked again.
 pub fn project(
     sampler: &Sampler<'_>,
     positions: Vec<DVec3>,
@@ -89,6 +90,8 @@ pub fn project(
 ) -> Result<OnZero, Canceled> {
     /// Steps at most.
     const STEPS: usize = 5;
+    /// A step of at most this share of the reach is short.
+    const SHORT: f64 = 0.1;
     let mut at = positions;
     let (mut values, mut gradients) = sampler.gradients(&at)?;
     let strayed: Vec<usize> = (0..at.len()).filter(|&i| is_stray(gradients[i], normals[i])).collect();
@@ -98,6 +101,15 @@ pub fn project(
     let (new_values, new_gradients) = sampler.gradients(&places)?;
     for (k, &i) in moved.iter().enumerate() {
         (at[i], values[i], gradients[i]) = (places[k], new_values[k], new_gradients[k]);
+    }
+    if sampler.field().metric() == Metric::Exact {
+        for i in 0..at.len() {
+            let unit = (gradients[i].length() - 1.0).abs() < 1e-3;
+            if unit && values[i].abs() <= SHORT * reach && !is_stray(gradients[i], normals[i]) {
+                at[i] -= values[i] * gradients[i];
+                values[i] = 0.0;
+            }
+        }
     }
     let mut active: Vec<u32> = (0..at.len() as u32).collect();
     let mut fraction = vec![1.0f64; at.len()];
