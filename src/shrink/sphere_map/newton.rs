@@ -176,9 +176,10 @@ impl System {
         Self { frames, nodes, edges }
     }
 
-    /// Hessian times `p`.
-    fn product(&self, level: &Level, p: &[DVec2], out: &mut [DVec2], settings: &Settings<'_>) {
-        let piece = |k: usize, out: &mut [DVec2]| {
+    /// Hessian times `p`; returns the product of both.
+    fn product(&self, level: &Level, p: &[DVec2], out: &mut [DVec2], settings: &Settings<'_>) -> f64 {
+        let piece = |(k, out): (usize, &mut [DVec2])| {
+            let mut curvature = 0.0;
             for (i, y) in out.iter_mut().enumerate() {
                 let v = k * CHUNK + i;
                 let range = level.range(v);
@@ -187,13 +188,15 @@ impl System {
                     sum += *m * p[u as usize];
                 }
                 *y = sum;
+                curvature += p[v].dot(sum);
             }
+            curvature
         };
         if level.len() < PARALLEL {
-            out.chunks_mut(CHUNK).enumerate().for_each(|(k, out)| piece(k, out));
-        } else {
-            settings.pool.install(|| out.par_chunks_mut(CHUNK).enumerate().for_each(|(k, out)| piece(k, out)));
+            return out.chunks_mut(CHUNK).enumerate().map(piece).sum();
         }
+        let pieces: Vec<f64> = settings.pool.install(|| out.par_chunks_mut(CHUNK).enumerate().map(piece).collect());
+        pieces.into_iter().sum()
     }
 
     /// Conjugate gradients with the diagonal blocks as preconditioner, stopped early: where the residual is small enough
@@ -205,24 +208,25 @@ impl System {
         let mut z: Vec<DVec2> = r.iter().zip(&self.nodes).map(|(r, k)| k.inverse * *r).collect();
         let mut p = z.clone();
         let mut q = vec![DVec2::ZERO; n];
-        let mut rz = level.sum(settings, |v| r[v].dot(z[v]));
+        let mut rz: f64 = (0..n).map(|v| r[v].dot(z[v])).sum();
         let start = rz;
         /// The residual's share at which a solution is good enough far from the minimum.
         const FORCING: f64 = 0.05;
         for k in 0..products {
             settings.cancel.check()?;
-            self.product(level, &p, &mut q, settings);
-            let curvature = level.sum(settings, |v| p[v].dot(q[v]));
+            let curvature = self.product(level, &p, &mut q, settings);
             if curvature.is_nan() || curvature <= 0.0 {
                 return Ok((if k == 0 { p } else { x }, k + 1));
             }
             let alpha = rz / curvature;
+            // too little work to wake threads for
+            let mut next = 0.0;
             for v in 0..n {
                 x[v] += alpha * p[v];
                 r[v] -= alpha * q[v];
                 z[v] = self.nodes[v].inverse * r[v];
+                next += r[v].dot(z[v]);
             }
-            let next = level.sum(settings, |v| r[v].dot(z[v]));
             if next <= FORCING * FORCING * start {
                 return Ok((x, k + 1));
             }
