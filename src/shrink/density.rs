@@ -86,3 +86,73 @@ fn reach(mesh: &Mesh, normals: &[DVec3], largest: f64, settings: &Settings<'_>) 
     let both = |v: usize| ball(v, normals[v]).min(ball(v, -normals[v]));
     settings.pool.install(|| (0..mesh.positions.len()).into_par_iter().with_min_len(CHUNK).map(both).collect())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::rings::Rings;
+    use super::*;
+    use crate::settings::{CancelToken, Progress};
+
+    /// A box of these half sides, every face a grid of `n` x `n`.
+    fn block(half: DVec3, n: i32) -> Mesh {
+        let mut numbers = std::collections::HashMap::new();
+        let (mut positions, mut triangles) = (Vec::new(), Vec::new());
+        for (axis, side) in [(0, -1), (0, 1), (1, -1), (1, 1), (2, -1), (2, 1)] {
+            let mut vertex = |i: i32, j: i32| {
+                let mut key = [0; 3];
+                (key[axis], key[(axis + 1) % 3], key[(axis + 2) % 3]) = (side * n, 2 * i - n, 2 * j - n);
+                *numbers.entry(key).or_insert_with(|| {
+                    positions.push(DVec3::from_array(key.map(|k| f64::from(k) / f64::from(n))) * half);
+                    positions.len() as u32 - 1
+                })
+            };
+            for i in 0..n {
+                for j in 0..n {
+                    let mut quad = [vertex(i, j), vertex(i + 1, j), vertex(i + 1, j + 1), vertex(i, j + 1)];
+                    if side < 0 {
+                        quad.reverse();
+                    }
+                    triangles.extend([[quad[0], quad[1], quad[2]], [quad[0], quad[2], quad[3]]]);
+                }
+            }
+        }
+        let rings = Rings::new(positions.len(), &triangles).expect("a closed mesh");
+        Mesh { positions, rings }
+    }
+
+    fn made(mesh: &Mesh, kind: Density) -> Vec<f64> {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
+        let cancel = CancelToken::new();
+        density(mesh, kind, &Settings { pool: &pool, cancel: &cancel, progress: &|_: Progress| {} })
+    }
+
+    fn nearest(mesh: &Mesh, q: DVec3) -> usize {
+        let distance = |v: &usize| mesh.positions[*v].distance_squared(q);
+        (0..mesh.positions.len()).min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap()
+    }
+
+    #[test]
+    fn a_plate_is_dense_at_its_rim_by_curvature_and_everywhere_by_reach() {
+        let plate = block(DVec3::new(1.0, 1.0, 0.05), 16);
+        let middle = nearest(&plate, DVec3::new(0.0, 0.0, 0.05));
+        let rim = nearest(&plate, DVec3::new(1.0, 0.0, 0.05));
+        assert!(made(&plate, Density::Area).iter().all(|&d| d == 1.0));
+        let by_curvature = made(&plate, Density::Curvature);
+        assert_eq!(by_curvature[middle], 1.0);
+        assert!(by_curvature[rim] > 1.5, "{}", by_curvature[rim]);
+        let by_reach = made(&plate, Density::Reach);
+        assert!(by_reach[middle] > 2.0, "{}", by_reach[middle]);
+    }
+
+    #[test]
+    fn a_cube_is_thin_nowhere_and_its_reach_is_half_its_width_or_more() {
+        let cube = block(DVec3::ONE, 16);
+        let normals: Vec<DVec3> = (0..cube.positions.len() as u32).map(|v| cube.vertex_normal(v)).collect();
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+        let cancel = CancelToken::new();
+        let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_: Progress| {} };
+        let middle = nearest(&cube, DVec3::Z);
+        let reach = reach(&cube, &normals, 10.0, &settings)[middle];
+        assert!((reach - 1.0).abs() < 0.02, "the ball that fills the cube has radius 1, not {reach}");
+    }
+}

@@ -120,3 +120,32 @@ impl Walk<'_> {
         (self.map.triangles[self.current], w.map(|x| x / sum))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::lattice::{LatticeSpec, SphereLattice};
+    use super::super::rings::Rings;
+    use super::*;
+    use crate::settings::{CancelToken, Progress};
+
+    #[test]
+    fn every_direction_is_found_in_a_triangle_that_holds_it_whoever_looks() {
+        let base = SphereLattice::new(LatticeSpec::Octahedral { n: 12 });
+        let rings = Rings::new(base.directions.len(), &base.triangles(&vec![false; base.quads.len()])).unwrap();
+        let mesh = Mesh { positions: base.directions.clone(), rings };
+        let queries = SphereLattice::new(LatticeSpec::Latlong { n_theta: 120, n_phi: 60 }).directions;
+        assert!(queries.len() > 3 * CHUNK, "more than one walk");
+        let found = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let cancel = CancelToken::new();
+            let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_: Progress| {} };
+            locate(&mesh, &base.directions, &queries, &settings).unwrap()
+        };
+        let places = found(1);
+        for (q, (t, w)) in queries.iter().zip(&places) {
+            let p: DVec3 = (0..3).map(|c| w[c] * base.directions[t[c] as usize]).sum();
+            assert!(p.normalize().distance(*q) < 1e-9, "{q} was placed at {p}");
+        }
+        assert_eq!(places, found(5));
+    }
+}

@@ -175,12 +175,12 @@ fn reference(positions: &[DVec3], scales: &[f64], t: [u32; 3]) -> Reference {
 
 impl Inserter<'_> {
     /// The vertices that are there as a [`Level`], and their places. Sorts them, which keeps neighbours together in memory.
-    fn level(&self, active: &mut Vec<u32>, settings: &Settings<'_>) -> (Level, Vec<DVec3>) {
+    fn level(&self, active: &mut [u32], settings: &Settings<'_>) -> (Level, Vec<DVec3>) {
         active.sort_unstable();
         let places = active.iter().map(|&v| self.directions[v as usize]).collect();
         let reference = |t| reference(self.positions, &self.scales, t);
         let ring = |v| self.rings.ring(v);
-        (Level::new(active.clone(), self.positions.len(), ring, reference, settings), places)
+        (Level::new(active.to_vec(), self.positions.len(), ring, reference, settings), places)
     }
 
     /// Takes places back from a level.

@@ -14,6 +14,15 @@ pub const CHUNK: usize = 512;
 /// Meshes below this many vertices are not worth waking threads for.
 pub const PARALLEL: usize = 4096;
 
+/// A corner of a triangle. Triangles are numbered by their smallest vertex, which is their corner 0, and its ring.
+#[derive(Clone, Copy)]
+pub struct Place {
+    /// The triangle's number.
+    pub triangle: u32,
+    /// 0, 1 or 2.
+    pub corner: u8,
+}
+
 /// Connectivity and references of a mesh, rings in one array.
 pub struct Level {
     /// Number in the whole mesh of every vertex here.
@@ -24,6 +33,8 @@ pub struct Level {
     pub ring: Vec<u32>,
     /// Reference of the triangle between a ring's entry and the next one, seen from the ring's vertex.
     pub references: Vec<Reference>,
+    /// Which triangle that is, and which of its corners the vertex is.
+    pub triangles: Vec<Place>,
     /// Vertices by colour.
     colours: Vec<Vec<u32>>,
 }
@@ -48,7 +59,8 @@ impl Level {
             ring.extend(ring_of(v).iter().map(|&u| number[u as usize]));
             first.push(ring.len() as u32);
         }
-        let mut level = Self { vertices, first, ring, references: Vec::new(), colours: Vec::new() };
+        let mut level =
+            Self { vertices, first, ring, references: Vec::new(), triangles: Vec::new(), colours: Vec::new() };
         level.references = level.map_rows(settings, |v, out| {
             let (here, ring) = (level.vertices[v], level.ring(v));
             for i in 0..ring.len() {
@@ -56,6 +68,7 @@ impl Level {
                 out.push(reference([here, level.vertices[b], level.vertices[c]]));
             }
         });
+        level.number_triangles();
         level.colour();
         level
     }
@@ -77,6 +90,32 @@ impl Level {
     pub fn wedges(&self, v: usize) -> impl Iterator<Item = [usize; 2]> {
         let ring = self.ring(v);
         (0..ring.len()).map(|i| [ring[i] as usize, ring[(i + 1) % ring.len()] as usize])
+    }
+
+    fn number_triangles(&mut self) {
+        const OTHERS: u32 = u32::MAX;
+        let mut places = vec![Place { triangle: OTHERS, corner: 0 }; self.ring.len()];
+        let mut count = 0;
+        for v in 0..self.len() {
+            for (slot, [b, c]) in self.range(v).zip(self.wedges(v)) {
+                if v < b && v < c {
+                    places[slot].triangle = count;
+                    count += 1;
+                }
+            }
+        }
+        for v in 0..self.len() {
+            for (slot, [b, c]) in self.range(v).zip(self.wedges(v)) {
+                if places[slot].triangle == OTHERS {
+                    // the smallest vertex, the one after it, and where `v` is counted from there
+                    let (owner, next, corner) = if b < c { (b, c, 2) } else { (c, v, 1) };
+                    let ring = self.ring(owner);
+                    let at = ring.iter().position(|&u| u as usize == next).expect("corners of a triangle are joined");
+                    places[slot] = Place { triangle: places[self.range(owner).start + at].triangle, corner };
+                }
+            }
+        }
+        self.triangles = places;
     }
 
     /// The first colour that no neighbour has, vertex by vertex.

@@ -37,12 +37,17 @@ pub struct Descent {
 /// The Hessian at a map, in tangent coordinates: a 2 x 2 block per vertex and per edge, and the gradient.
 struct System {
     frames: Vec<[DVec3; 2]>,
-    gradient: Vec<DVec2>,
-    diagonal: Vec<DMat2>,
+    nodes: Vec<Node>,
     /// Blocks of every vertex against its ring, in the ring's order.
     edges: Vec<DMat2>,
-    /// Inverses of the diagonal blocks with their eigenvalues made positive.
-    inverse: Vec<DMat2>,
+}
+
+/// One vertex's share of a [`System`].
+struct Node {
+    gradient: DVec2,
+    diagonal: DMat2,
+    /// Inverse of the diagonal block with its eigenvalues made positive.
+    inverse: DMat2,
 }
 
 /// Takes Newton steps until the energy that is left to gain is small, each followed by a sweep of vertex steps. The energy
@@ -60,7 +65,7 @@ pub fn descend(
         let system = System::new(level, places, objective, settings);
         let (direction, used) = system.solve(level, effort.products, settings)?;
         descent.products += used;
-        let slope: f64 = level.sum(settings, |v| system.gradient[v].dot(direction[v]));
+        let slope: f64 = level.sum(settings, |v| system.nodes[v].gradient.dot(direction[v]));
         descent.decrement = -0.5 * slope / descent.energy;
         if slope.is_nan() || slope >= 0.0 || descent.decrement < effort.tolerance {
             break;
@@ -138,78 +143,60 @@ impl System {
                 out.push(Triangle::new([v, b, c], places, &frames, reference, objective));
             }
         });
-        // the number of the first triangle of every vertex that is its triangles' smallest
-        let mut owned = vec![0u32; level.len() + 1];
-        for v in 0..level.len() {
-            owned[v + 1] = owned[v] + level.wedges(v).filter(|&[b, c]| v < b && v < c).count() as u32;
-        }
-        let find = |v: usize, b: usize, c: usize| -> (usize, usize) {
-            // the corner of the smallest vertex, and where `v` is counted from there
-            let (owner, next, corner) = if v < b && v < c {
-                (v, b, 0)
-            } else if b < c {
-                (b, c, 2)
-            } else {
-                (c, v, 1)
-            };
-            let before = level.wedges(owner).take_while(|w| w[0] != next).filter(|&[b, c]| owner < b && owner < c);
-            (owned[owner] as usize + before.count(), corner)
+        // every triangle that a vertex is at, turned to start there
+        let around = |v: usize| {
+            level.triangles[level.range(v)]
+                .iter()
+                .map(|place| (&triangles[place.triangle as usize], place.corner as usize))
         };
-        let rows = level.map_rows(settings, |v, out: &mut Vec<Row>| {
-            let mut row =
-                Row { gradient: DVec2::ZERO, diagonal: DMat2::ZERO, edges: vec![DMat2::ZERO; level.ring(v).len()] };
-            let mut inward = 0.0;
-            for (i, [b, c]) in level.wedges(v).enumerate() {
-                let (t, corner) = find(v, b, c);
-                let t = &triangles[t];
-                row.gradient += t.gradient[corner];
+        let nodes = level.map_rows(settings, |v, out: &mut Vec<Node>| {
+            let (mut gradient, mut diagonal, mut inward) = (DVec2::ZERO, DMat2::ZERO, 0.0);
+            for (t, corner) in around(v) {
+                gradient += t.gradient[corner];
                 inward += t.inward[corner];
-                let next = (i + 1) % row.edges.len();
                 for mode in &t.modes {
-                    let [x, b, c] = [0, 1, 2].map(|k| mode[(corner + k) % 3]);
-                    row.diagonal += outer(x, x);
-                    row.edges[i] += outer(x, b);
-                    row.edges[next] += outer(x, c);
+                    diagonal += outer(mode[corner], mode[corner]);
                 }
             }
             // the sphere's own curvature, where it does not bend the energy downwards
-            row.diagonal += DMat2::from_diagonal(DVec2::splat(inward.max(0.0)));
-            out.push(row);
+            diagonal += DMat2::from_diagonal(DVec2::splat(f64::max(inward, 0.0)));
+            out.push(Node { gradient, diagonal, inverse: inverse_positive(diagonal) });
         });
-        let mut system = Self {
-            frames,
-            gradient: Vec::with_capacity(level.len()),
-            diagonal: Vec::with_capacity(level.len()),
-            edges: Vec::with_capacity(level.ring.len()),
-            inverse: Vec::with_capacity(level.len()),
-        };
-        for row in rows {
-            system.gradient.push(row.gradient);
-            system.inverse.push(inverse_positive(row.diagonal));
-            system.diagonal.push(row.diagonal);
-            system.edges.extend(row.edges);
-        }
-        system
+        let edges = level.map_rows(settings, |v, out: &mut Vec<DMat2>| {
+            let (start, valence) = (out.len(), level.range(v).len());
+            out.resize(start + valence, DMat2::ZERO);
+            for (i, (t, corner)) in around(v).enumerate() {
+                for mode in &t.modes {
+                    let [x, b, c] = [0, 1, 2].map(|k| mode[(corner + k) % 3]);
+                    out[start + i] += outer(x, b);
+                    out[start + (i + 1) % valence] += outer(x, c);
+                }
+            }
+        });
+        Self { frames, nodes, edges }
     }
 
-    /// Hessian times `p`.
-    fn product(&self, level: &Level, p: &[DVec2], out: &mut [DVec2], settings: &Settings<'_>) {
-        let piece = |k: usize, out: &mut [DVec2]| {
+    /// Hessian times `p`; returns the product of both.
+    fn product(&self, level: &Level, p: &[DVec2], out: &mut [DVec2], settings: &Settings<'_>) -> f64 {
+        let piece = |(k, out): (usize, &mut [DVec2])| {
+            let mut curvature = 0.0;
             for (i, y) in out.iter_mut().enumerate() {
                 let v = k * CHUNK + i;
                 let range = level.range(v);
-                let mut sum = self.diagonal[v] * p[v];
+                let mut sum = self.nodes[v].diagonal * p[v];
                 for (m, &u) in self.edges[range.clone()].iter().zip(&level.ring[range]) {
                     sum += *m * p[u as usize];
                 }
                 *y = sum;
+                curvature += p[v].dot(sum);
             }
+            curvature
         };
         if level.len() < PARALLEL {
-            out.chunks_mut(CHUNK).enumerate().for_each(|(k, out)| piece(k, out));
-        } else {
-            settings.pool.install(|| out.par_chunks_mut(CHUNK).enumerate().for_each(|(k, out)| piece(k, out)));
+            return out.chunks_mut(CHUNK).enumerate().map(piece).sum();
         }
+        let pieces: Vec<f64> = settings.pool.install(|| out.par_chunks_mut(CHUNK).enumerate().map(piece).collect());
+        pieces.into_iter().sum()
     }
 
     /// Conjugate gradients with the diagonal blocks as preconditioner, stopped early: where the residual is small enough
@@ -217,28 +204,29 @@ impl System {
     fn solve(&self, level: &Level, products: usize, settings: &Settings<'_>) -> Result<(Vec<DVec2>, usize), Canceled> {
         let n = level.len();
         let mut x = vec![DVec2::ZERO; n];
-        let mut r: Vec<DVec2> = self.gradient.iter().map(|g| -*g).collect();
-        let mut z: Vec<DVec2> = r.iter().zip(&self.inverse).map(|(r, m)| *m * *r).collect();
+        let mut r: Vec<DVec2> = self.nodes.iter().map(|k| -k.gradient).collect();
+        let mut z: Vec<DVec2> = r.iter().zip(&self.nodes).map(|(r, k)| k.inverse * *r).collect();
         let mut p = z.clone();
         let mut q = vec![DVec2::ZERO; n];
-        let mut rz = level.sum(settings, |v| r[v].dot(z[v]));
+        let mut rz: f64 = (0..n).map(|v| r[v].dot(z[v])).sum();
         let start = rz;
         /// The residual's share at which a solution is good enough far from the minimum.
         const FORCING: f64 = 0.05;
         for k in 0..products {
             settings.cancel.check()?;
-            self.product(level, &p, &mut q, settings);
-            let curvature = level.sum(settings, |v| p[v].dot(q[v]));
+            let curvature = self.product(level, &p, &mut q, settings);
             if curvature.is_nan() || curvature <= 0.0 {
                 return Ok((if k == 0 { p } else { x }, k + 1));
             }
             let alpha = rz / curvature;
+            // too little work to wake threads for
+            let mut next = 0.0;
             for v in 0..n {
                 x[v] += alpha * p[v];
                 r[v] -= alpha * q[v];
-                z[v] = self.inverse[v] * r[v];
+                z[v] = self.nodes[v].inverse * r[v];
+                next += r[v].dot(z[v]);
             }
-            let next = level.sum(settings, |v| r[v].dot(z[v]));
             if next <= FORCING * FORCING * start {
                 return Ok((x, k + 1));
             }
@@ -250,13 +238,6 @@ impl System {
         }
         Ok((x, products))
     }
-}
-
-/// One vertex's share of a [`System`].
-struct Row {
-    gradient: DVec2,
-    diagonal: DMat2,
-    edges: Vec<DMat2>,
 }
 
 /// u v^T.
