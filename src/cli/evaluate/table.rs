@@ -13,14 +13,21 @@ const NONE: &str = "–";
 pub fn to_text(found: &Evaluation, mesh: &Path, truth: &Path, kind: &str) -> String {
     let name = |path: &Path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
     let mut text = format!(
-        "{} against {} ({kind}).\nDistances and the field's own absolute values in parts of the diagonal of the truth's bounding box ({:.6} scene \
-         units). CD, F1, ECD and EF1: 100,000 samples of each side,\nlongest side of the truth at 0.9 (NDC: scene units x \
-         {:.6}); the truth against itself is their floor.\n\n",
+        "{} against {} ({kind}).\nDistances and the field's own absolute values in parts of the diagonal of the truth's \
+         bounding box ({:.6} scene units).\n",
         name(mesh),
         name(truth),
-        found.diagonal,
-        found.ndc_scale
+        found.diagonal
     );
+    if found.surface.chamfer.is_some() {
+        let _ = writeln!(
+            text,
+            "CD, F1, ECD and EF1: 100,000 samples of each side, longest side of the truth at 0.9 (NDC: scene units x {:.6}); \
+             the truth against itself is their floor.",
+            found.ndc_scale
+        );
+    }
+    text.push('\n');
     text.push_str(&laid_out(&figures(found)));
     if let Some(chart) = &found.parameterization {
         text.push_str("\nParameterization (areas matched globally; weighted by area on the surface):\n\n");
