@@ -33,6 +33,11 @@ impl Reference {
         }
     }
 
+    /// The equilateral triangle of this edge length.
+    pub fn equilateral(edge: f64) -> Self {
+        Self { area: 3f64.sqrt() / 4.0 * edge * edge, cotangents: [1.0 / 3f64.sqrt(); 3] }
+    }
+
     /// Dirichlet energy per area: squared Frobenius norm of the Jacobian of the map that takes the reference to `x, b, c`.
     pub fn dirichlet(&self, x: DVec3, b: DVec3, c: DVec3) -> f64 {
         let [cx, cb, cc] = self.cotangents;

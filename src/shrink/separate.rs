@@ -4,11 +4,10 @@
 //! chords of the lattice, being apart comes before being exactly on the zero level set.
 
 use super::Wrap;
-use super::base::mix_targets;
 use super::collide::{Bounds, Index, crossings, meet, overlap};
 use super::energy::Reference;
 use super::lattice::SphereLattice;
-use super::unfold::{Corners, Problem, grow, relax, smooth};
+use super::unfold::{Corners, Problem, grow, mix_targets, relax, smooth};
 use super::untangle::{FOLD, Random, Tangle, masked};
 use super::zero::{OnZero, step_to_zero};
 use crate::field::Sampler;
