@@ -84,8 +84,8 @@ pub fn extract(
 ) -> Result<Extracted, ShrinkError> {
     let told = Told { settings: *sampler.settings(), fraction: AtomicU32::new(0) };
     let (mut depth, mut mended) = (0, None);
+    begins(Part::Shrink);
     if spec.method == Method::Adaptive {
-        begins(Part::Shrink);
         told.tell(0, 0.0, 0.0, Progress { stage: "topology", ..Progress::default() });
         mended = study(sampler, spec, depth)?;
     }
@@ -98,7 +98,9 @@ pub fn extract(
         if attempt > 0 && !budget.allows(before, costliest) {
             break;
         }
-        begins(Part::Shrink);
+        if attempt > 0 {
+            begins(Part::Shrink);
+        }
         // what went wrong may be a handle or a gap narrower than the first look's lattice
         if attempt > 0 && mended.is_some() && depth < DEEPEST {
             depth += 1;

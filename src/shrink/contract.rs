@@ -199,6 +199,8 @@ fn thin(sampler: &Sampler<'_>, grid: &Grid3, what: Thin) -> Result<Vec<(usize, D
     const SLACK: f64 = 0.3;
     /// The solid beside a gap is at least this thick, in spacings: nothing is opened into a thin wall.
     const BACKED: f64 = 1.5;
+    /// Places across a gap, from its near side, in spacings; one of them at least must be outside the solid.
+    const WITHIN: [f64; 5] = [0.03, 0.1, 0.25, 0.5, 1.0];
     let h = grid.h;
     // seen from the other side a gap is a wall
     let sign = if what == Thin::Wall { 1.0 } else { -1.0 };
@@ -229,12 +231,26 @@ fn thin(sampler: &Sampler<'_>, grid: &Grid3, what: Thin) -> Result<Vec<(usize, D
         probes.push(points[k] - normal * (distance + PROBE * h));
     }
     let below = sampler.values(&probes)?;
-    let is_thin = |k: usize| {
+    let is_thin = |&k: &usize| {
         let steep = gradients[k].length().max(1e-9);
         let behind = || grid.interpolate(points[k] - gradients[k] * (BACKED * h / steep));
         sign * below[k] > -SOLID * h * steep && (what == Thin::Wall || behind().is_some_and(|b| b < -SOLID * h))
     };
-    Ok((0..nodes.len()).filter(|&k| is_thin(k)).map(|k| (nodes[k], feet[k])).collect())
+    let mut found: Vec<usize> = (0..nodes.len()).filter(is_thin).collect();
+    if what == Thin::Gap {
+        // parts of a union that only touch have a zero level set between them, but no gap
+        let across: Vec<DVec3> = found
+            .iter()
+            .flat_map(|&k| {
+                let beyond = (probes[k] - points[k]).normalize_or_zero();
+                WITHIN.map(|t| feet[k] + (t - 0.05) * h * beyond)
+            })
+            .collect();
+        let between = sampler.values(&across)?;
+        let mut open = between.chunks_exact(WITHIN.len()).map(|s| s.iter().any(|&v| v > 0.0));
+        found.retain(|_| open.next().unwrap_or(false));
+    }
+    Ok(found.into_iter().map(|k| (nodes[k], feet[k])).collect())
 }
 
 /// The moves of nodes, each shortened until no tetrahedron around it turns inside out, so that the front stays embedded.

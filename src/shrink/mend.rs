@@ -51,8 +51,9 @@ pub struct Mended<'a> {
     pub(super) truth: Option<TriangleMesh>,
 }
 
-/// Least value where another component is made outside, in spacings: beyond what the contraction probes for thin walls.
-const AWAY: f64 = 1.0;
+/// Least value where another component is made outside, in spacings: beyond what a contraction on a lattice half as fine
+/// probes for thin walls.
+const AWAY: f64 = 2.0;
 /// Least depth where a void is filled, in spacings.
 const FILL: f64 = 0.5;
 
