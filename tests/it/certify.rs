@@ -183,12 +183,12 @@ fn meshes_with_handles_are_refused_with_their_genus_and_wrapped_when_asked() {
         };
         let (code, said) = run(&[]);
         assert_eq!(code, Some(4), "{} {said}", mesh.display());
-        assert!(said.contains(&format!("genus {genus},")), "{said}");
+        assert!(said.contains(&format!("genus {genus} ")), "{said}");
         let (code, said) = run(&["--on-topology", "wrap", "--report", report.to_str().expect("text")]);
         assert_eq!(code, Some(0), "{} {said}", mesh.display());
         let report: Value = serde_json::from_slice(&std::fs::read(&report).expect("reads")).expect("JSON");
         assert_eq!(report["topology"]["handles"], genus, "{}", mesh.display());
         let area = report["topology"]["invented_area"].as_f64().expect("a share");
-        assert!(area > 0.0 && area < 0.3, "{} invents {area}", mesh.display());
+        assert!(area > 0.0 && area < 0.5, "{} invents {area}", mesh.display());
     }
 }
