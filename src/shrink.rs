@@ -7,12 +7,13 @@
 mod adaptive;
 mod base;
 mod collide;
+mod complex;
 mod contract;
 mod creases;
 pub mod curve;
 mod density;
 mod energy;
-mod grid3;
+mod graded;
 pub mod lattice;
 mod locate;
 pub mod mend;

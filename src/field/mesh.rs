@@ -4,6 +4,7 @@
 //! place and cuts polygons into triangles. [`MeshField`] is the signed distance to such a mesh. Nothing is allocated
 //! from a count in a file before the file was seen to be long enough for it.
 
+mod boundary;
 mod closest;
 mod distance;
 mod glb;

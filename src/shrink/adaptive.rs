@@ -26,9 +26,9 @@ struct Attempt {
 }
 
 const ATTEMPTS: [Attempt; 3] = [
-    Attempt { resolution: Resolution { levels: 3, probe: true }, fineness: 1.0, share: (0.0, 0.7) },
-    Attempt { resolution: Resolution { levels: 4, probe: true }, fineness: 2.0, share: (0.7, 0.9) },
-    Attempt { resolution: Resolution { levels: 4, probe: false }, fineness: 2.0, share: (0.9, 1.0) },
+    Attempt { resolution: Resolution { levels: 3, probe: true, local: 0 }, fineness: 1.0, share: (0.0, 0.7) },
+    Attempt { resolution: Resolution { levels: 3, probe: true, local: 2 }, fineness: 2.0, share: (0.7, 0.9) },
+    Attempt { resolution: Resolution { levels: 4, probe: false, local: 1 }, fineness: 2.0, share: (0.9, 1.0) },
 ];
 
 /// Vertices of the base surface that a lattice is sampled from: half as many as the default lattice has, and more slowly
@@ -78,7 +78,7 @@ fn one(
         });
     };
     stage("contract", 0.0, None, None, None);
-    let front = contract(scene, attempt.resolution)?;
+    let front = contract(scene, attempt.resolution, places)?;
     let frame = front.frame;
     let show = |positions: &[DVec3], triangles: Vec<[u32; 3]>| Front {
         positions: positions.iter().map(|&p| frame.to_scene(p).as_vec3().to_array()).collect(),

@@ -1,8 +1,9 @@
 //! A field mended so that a sphere can wrap it: other components are made outside, voids are filled, handles are plugged and
 //! components are bridged. Later stages see an ordinary field of genus 0.
 
+use super::graded::Graded;
 use crate::field::mesh::{Sheet, TriangleMesh};
-use crate::field::{Domain, Field, Gradients, Metric, Points};
+use crate::field::{Domain, Field, Frame, Gradients, Metric, Points};
 use glam::DVec3;
 
 /// What becomes of the space around a lattice node.
@@ -16,21 +17,24 @@ pub(super) enum Label {
     Fill,
 }
 
-/// Labels on a lattice, in scene units.
+/// Labels on a lattice.
 pub(super) struct Territory {
-    pub origin: DVec3,
-    pub spacing: f64,
-    pub nodes: [usize; 3],
-    /// z fastest.
+    pub grid: Graded,
+    /// The frame that the lattice is in.
+    pub frame: Frame,
+    /// A label for every node.
     pub labels: Vec<Label>,
 }
 
 impl Territory {
-    /// The label of the nearest node; beyond the lattice, of the nearest one on its border.
+    /// The label of the nearest corner of the cell around a place, scene units; beyond the lattice, of the nearest one on its
+    /// border.
     pub(super) fn label(&self, p: DVec3) -> Label {
-        let q = ((p - self.origin) / self.spacing).round();
-        let at = |k: usize| (q[k].max(0.0) as usize).min(self.nodes[k] - 1);
-        self.labels[(at(0) * self.nodes[1] + at(1)) * self.nodes[2] + at(2)]
+        self.labels[self.grid.nearest(self.frame.from_scene(p))]
+    }
+    /// Spacing of the lattice where it is finest, scene units.
+    fn spacing(&self) -> f64 {
+        self.grid.h() * self.frame.scale
     }
 }
 
@@ -61,7 +65,7 @@ impl Mended<'_> {
     /// The value with other components outside and voids filled.
     fn settled(&self, p: DVec3, value: f32) -> f32 {
         let Some(territory) = &self.territory else { return value };
-        let step = (self.slope * territory.spacing) as f32;
+        let step = (self.slope * territory.spacing()) as f32;
         match territory.label(p) {
             Label::Keep => value,
             Label::Away => value.max(AWAY as f32 * step),

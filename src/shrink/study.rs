@@ -7,15 +7,16 @@
 //!
 //! Not guaranteed: that a handle narrower than the lattice is found; a finer study finds it.
 
+use super::complex::{Complex, Rings};
 use super::contract::{Lattice, Resolution, carve, lattice, mark};
-use super::grid3::{Grid3, NEIGHBOURS};
+use super::graded::Graded;
 use super::mend::{Label, Mended, Plug, Territory};
-use super::topology::{PLACES, clusters, euler, middle, neighbour};
+use super::topology::{PLACES, middle};
 use super::{Component, OnTopology, ShrinkError, ShrinkSpec};
 use crate::field::mesh::{Sheet, TriangleMesh};
 use crate::field::{Frame, Sampler};
 use crate::settings::{CancelToken, Canceled};
-use glam::{DVec3, IVec3};
+use glam::DVec3;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 /// Doublings of the coarsest lattice in a first study.
@@ -74,24 +75,25 @@ pub fn study<'a>(sampler: &Sampler<'a>, spec: &ShrinkSpec, depth: u32) -> Result
     }
     sampler.tally().stage("topology");
     let cancel = sampler.settings().cancel;
-    let resolution = Resolution { levels: LEVELS + depth.min(DEEPEST), probe: true };
-    let Lattice { grid, frame, slope } = lattice(sampler, resolution).map_err(|refusal| refusal.error)?;
-    let mut values = mark(&sampler.framed(frame), &grid, resolution.probe)?.target;
+    let resolution = Resolution { levels: LEVELS + depth.min(DEEPEST), probe: true, local: 0 };
+    let Lattice { mut grid, frame, slope } = lattice(sampler, resolution).map_err(|refusal| refusal.error)?;
+    let h = grid.h();
+    let limit = (OBSTRUCTION * h) as f32;
+    let (complex, mut values, inside) = look(&sampler.framed(frame), &mut grid, limit)?;
     // what could not be given up and is near is an unevenness below the lattice: it counts as solid
-    let limit = (OBSTRUCTION * grid.h) as f32;
-    let inside = carve(&grid, &values, cancel)?;
-    let doubtful = (DOUBTFUL * grid.h) as f32;
+    let doubtful = (DOUBTFUL * h) as f32;
     let in_doubt = (0..grid.len()).any(|i| inside[i] && values[i] > doubtful && values[i] <= limit);
     if spec.component.is_some() && in_doubt && depth < DEEPEST {
         // an index must not depend on whether a narrow gap was seen
         return study(sampler, spec, depth + 1);
     }
     let solid: Vec<bool> = (0..grid.len()).map(|i| inside[i] && values[i] <= limit).collect();
-    let mut bodies = clusters(&grid, &solid);
-    bodies.sort_by_key(|body| std::cmp::Reverse(body.len()));
+    let mut bodies = complex.clusters(&solid);
+    let size = |body: &Vec<usize>| body.iter().map(|&i| complex.spacing(i).powi(3)).sum::<f64>();
+    bodies.sort_by(|a, b| size(b).total_cmp(&size(a)));
     let empty: Vec<bool> = solid.iter().map(|s| !s).collect();
     let voids: Vec<Vec<usize>> =
-        clusters(&grid, &empty).into_iter().filter(|c| !c.iter().any(|&i| grid.on_border(i))).collect();
+        complex.clusters(&empty).into_iter().filter(|c| !c.iter().any(|&i| complex.border[i])).collect();
     let chosen = match spec.component {
         None => None,
         Some(Component::Largest) => Some(0),
@@ -100,10 +102,10 @@ pub fn study<'a>(sampler: &Sampler<'a>, spec: &ShrinkSpec, depth: u32) -> Result
     if let Some(index) = chosen
         && index >= bodies.len()
     {
-        let places = bodies.iter().take(PLACES).map(|body| middle(&grid, body, frame)).collect();
+        let places = bodies.iter().take(PLACES).map(|body| middle(&complex, body, frame)).collect();
         return Err(ShrinkError::NoComponent { index: index as u32, count: bodies.len(), places });
     }
-    let territory = settle(&grid, &mut values, (&bodies, chosen, &voids), &solid, cancel)?;
+    let territory = settle(&complex, h, &mut values, (&bodies, chosen, &voids), &solid, cancel)?;
     let kept: Vec<bool> = match &territory {
         None => solid,
         Some(labels) => {
@@ -115,22 +117,17 @@ pub fn study<'a>(sampler: &Sampler<'a>, spec: &ShrinkSpec, depth: u32) -> Result
         components: bodies.len() as u32,
         voids: voids.len() as u32,
         component: chosen.map(|index| index as u32),
-        handles: (pieces - euler(&grid, &kept)).max(0) as u32,
+        handles: (pieces - complex.euler(&kept)).max(0) as u32,
         ..Topology::default()
     };
     let mut plugs = Vec::new();
     if spec.on_topology == OnTopology::Wrap {
-        (plugs, topology.places) = plug(&grid, &mut values, frame, cancel)?;
+        (plugs, topology.places) = plug((&grid, &complex), &mut values, frame, cancel)?;
     }
     if territory.is_none() && plugs.is_empty() {
         return Ok(Some(Study { field: None, topology }));
     }
-    let territory = territory.map(|labels| Territory {
-        origin: frame.to_scene(grid.origin),
-        spacing: grid.h * frame.scale,
-        nodes: grid.nodes,
-        labels,
-    });
+    let territory = territory.map(|labels| Territory { grid, frame, labels });
     let mut field = Mended { field: sampler.field(), territory, plugs, slope, truth: None };
     if field.plugs.is_empty() {
         field.truth = sampler.field().truth().map(|mesh| left_of(mesh, &field));
@@ -138,10 +135,31 @@ pub fn study<'a>(sampler: &Sampler<'a>, spec: &ShrinkSpec, depth: u32) -> Result
     Ok(Some(Study { field: Some(field), topology }))
 }
 
+/// The lattice's complex, what the nodes count with, and what a carved ball leaves inside. Where nodes that are farther
+/// outside than `limit` could not be given up, the lattice is made as fine as it is near the zero level set.
+fn look(sampler: &Sampler<'_>, grid: &mut Graded, limit: f32) -> Result<(Complex, Vec<f32>, Vec<bool>), Canceled> {
+    /// Rounds at most; a membrane may move when the lattice under it changes.
+    const ROUNDS: usize = 8;
+    let fine = grid.h();
+    let mut round = 0;
+    loop {
+        let complex = grid.complex(sampler.settings())?;
+        let values = mark(sampler, grid, &complex, true)?.target;
+        let inside = carve(&complex, &values, sampler.settings().cancel)?;
+        let coarse = |i: &usize| inside[*i] && values[*i] > limit && complex.spacing(*i) > 1.5 * fine;
+        let nodes: Vec<(usize, i32)> = (0..complex.len()).filter(coarse).map(|i| (i, complex.sides[i])).collect();
+        round += 1;
+        if round == ROUNDS || nodes.is_empty() || !grid.halve_around(sampler, nodes, 1.0, 1.0)? {
+            return Ok((complex, values, inside));
+        }
+    }
+}
+
 /// Makes components other than the chosen one outside and fills voids, in the lattice's values; returns the label of every
 /// node, or `None` when there is nothing to do.
 fn settle(
-    grid: &Grid3,
+    complex: &Complex,
+    h: f64,
     values: &mut [f32],
     (bodies, chosen, voids): (&[Vec<usize>], Option<usize>, &[Vec<usize>]),
     solid: &[bool],
@@ -151,11 +169,11 @@ fn settle(
     if !others && voids.is_empty() {
         return Ok(None);
     }
-    let mut labels = vec![Label::Keep; grid.len()];
+    let mut labels = vec![Label::Keep; complex.len()];
     if others {
         let seeds: Vec<(&[usize], u32)> =
             bodies.iter().enumerate().map(|(k, body)| (body.as_slice(), u32::from(Some(k) != chosen))).collect();
-        let owner = flood(grid, &seeds, |_| true, cancel)?;
+        let owner = flood(complex, &seeds, |_| true, cancel)?;
         for (label, owner) in labels.iter_mut().zip(owner) {
             if owner == 1 {
                 *label = Label::Away;
@@ -164,21 +182,21 @@ fn settle(
     }
     if !voids.is_empty() {
         let is_void = {
-            let mut is_void = vec![false; grid.len()];
+            let mut is_void = vec![false; complex.len()];
             voids.iter().flatten().for_each(|&i| is_void[i] = true);
             is_void
         };
-        let exterior: Vec<usize> = (0..grid.len()).filter(|&i| !solid[i] && !is_void[i]).collect();
+        let exterior: Vec<usize> = (0..complex.len()).filter(|&i| !solid[i] && !is_void[i]).collect();
         let mut seeds: Vec<(&[usize], u32)> = vec![(exterior.as_slice(), 0)];
         seeds.extend(voids.iter().map(|void| (void.as_slice(), 1)));
-        let side = flood(grid, &seeds, |i| solid[i], cancel)?;
+        let side = flood(complex, &seeds, |i| solid[i], cancel)?;
         for (label, side) in labels.iter_mut().zip(side) {
             if side == 1 && *label == Label::Keep {
                 *label = Label::Fill;
             }
         }
     }
-    let h = grid.h as f32;
+    let h = h as f32;
     for (value, label) in values.iter_mut().zip(&labels) {
         match label {
             Label::Keep => {}
@@ -192,12 +210,12 @@ fn settle(
 /// For every node the mark of the seeds that reach it first, going through nodes that `may` be entered; `u32::MAX` where none
 /// does.
 fn flood(
-    grid: &Grid3,
+    complex: &Complex,
     seeds: &[(&[usize], u32)],
     may: impl Fn(usize) -> bool,
     cancel: &CancelToken,
 ) -> Result<Vec<u32>, Canceled> {
-    let mut mark = vec![u32::MAX; grid.len()];
+    let mut mark = vec![u32::MAX; complex.len()];
     let mut queue = VecDeque::new();
     for &(nodes, seed) in seeds {
         for &i in nodes {
@@ -205,18 +223,15 @@ fn flood(
             queue.push_back(i);
         }
     }
+    let mut rings = Rings::new(complex);
     let mut taken = 0u64;
     while let Some(i) = queue.pop_front() {
         taken += 1;
         if taken.is_multiple_of(1 << 16) {
             cancel.check()?;
         }
-        let here = grid.place(i);
-        for offset in NEIGHBOURS {
-            if let Some(j) = neighbour(grid, here, offset)
-                && mark[j] == u32::MAX
-                && may(j)
-            {
+        for j in rings.of(i).nodes.iter().map(|&j| j as usize) {
+            if mark[j] == u32::MAX && may(j) {
                 mark[j] = mark[i];
                 queue.push_back(j);
             }
@@ -228,37 +243,37 @@ fn flood(
 /// Carves, and makes solid what is near the nodes that could not be given up, until all can. Returns the plugs in scene units,
 /// and a place in each cluster of such nodes.
 fn plug(
-    grid: &Grid3,
+    (grid, complex): (&Graded, &Complex),
     values: &mut [f32],
     frame: Frame,
     cancel: &CancelToken,
 ) -> Result<(Vec<Plug>, Vec<[f64; 3]>), Canceled> {
-    let limit = (OBSTRUCTION * grid.h) as f32;
+    let limit = (OBSTRUCTION * grid.h()) as f32;
     let (mut membranes, mut bridges) = (Vec::<[DVec3; 3]>::new(), Vec::<[DVec3; 3]>::new());
     let mut places = Vec::new();
     for _ in 0..ROUNDS {
-        let inside = carve(grid, values, cancel)?;
-        let stuck: Vec<bool> = (0..grid.len()).map(|i| inside[i] && values[i] > 0.0).collect();
+        let inside = carve(complex, values, cancel)?;
+        let stuck: Vec<bool> = (0..complex.len()).map(|i| inside[i] && values[i] > 0.0).collect();
         let far: Vec<Vec<usize>> =
-            clusters(grid, &stuck).into_iter().filter(|c| c.iter().any(|&i| values[i] > limit)).collect();
+            complex.clusters(&stuck).into_iter().filter(|c| c.iter().any(|&i| values[i] > limit)).collect();
         if far.is_empty() {
             break;
         }
         for cluster in &far {
             if places.len() < PLACES {
-                places.push(middle(grid, cluster, frame));
+                places.push(middle(complex, cluster, frame));
             }
-            let (triangles, segments) = span(grid, cluster, &inside, values);
+            let (triangles, segments) = span(complex, cluster, &inside, values);
             membranes.extend(triangles);
             bridges.extend(segments.into_iter().map(|[a, b]| [a, b, b]));
         }
         cancel.check()?;
         for (list, radius) in [(&membranes, MEMBRANE), (&bridges, BRIDGE)] {
             let sheet = Sheet::new(list);
-            let reach = radius * grid.h;
+            let reach = radius * grid.h();
             for i in around(grid, list, reach) {
-                if let Some(foot) = sheet.nearest(grid.position(i), reach) {
-                    values[i] = values[i].min((foot.distance(grid.position(i)) - reach) as f32);
+                if let Some(foot) = sheet.nearest(complex.positions[i], reach) {
+                    values[i] = values[i].min((foot.distance(complex.positions[i]) - reach) as f32);
                 }
             }
             cancel.check()?;
@@ -267,66 +282,51 @@ fn plug(
     let to_scene =
         |list: &[[DVec3; 3]]| -> Vec<[DVec3; 3]> { list.iter().map(|t| t.map(|p| frame.to_scene(p))).collect() };
     let plugs = [(membranes, MEMBRANE), (bridges, BRIDGE)].into_iter().filter(|(list, _)| !list.is_empty());
-    let plugs =
-        plugs.map(|(list, radius)| Plug { sheet: Sheet::new(&to_scene(&list)), radius: radius * grid.h * frame.scale });
+    let plugs = plugs
+        .map(|(list, radius)| Plug { sheet: Sheet::new(&to_scene(&list)), radius: radius * grid.h() * frame.scale });
     Ok((plugs.collect(), places))
 }
 
 /// The nodes within `reach` of triangles that are no larger than a cell, and some more.
-fn around(grid: &Grid3, triangles: &[[DVec3; 3]], reach: f64) -> BTreeSet<usize> {
-    let steps = (reach / grid.h).ceil() as i32 + 1;
-    let mut nodes = BTreeSet::new();
-    for p in triangles.iter().flatten() {
-        let center = ((*p - grid.origin) / grid.h).round().as_ivec3();
-        for x in -steps..=steps {
-            for y in -steps..=steps {
-                for z in -steps..=steps {
-                    let c = (center + IVec3::new(x, y, z)).to_array();
-                    if (0..3).all(|k| c[k] >= 0 && (c[k] as usize) < grid.nodes[k]) {
-                        nodes.insert(grid.index(c[0] as usize, c[1] as usize, c[2] as usize));
-                    }
-                }
-            }
-        }
-    }
-    nodes
+fn around(grid: &Graded, triangles: &[[DVec3; 3]], reach: f64) -> BTreeSet<usize> {
+    triangles.iter().flatten().flat_map(|&p| grid.near(p, reach + grid.h())).collect()
 }
 
 /// The triangles and the lone edges of the lattice that a cluster of stuck nodes spans with itself and the solid it hangs
 /// on, smoothed, in frame units.
-fn span(grid: &Grid3, cluster: &[usize], inside: &[bool], values: &[f32]) -> (Vec<[DVec3; 3]>, Vec<[DVec3; 2]>) {
+fn span(complex: &Complex, cluster: &[usize], inside: &[bool], values: &[f32]) -> (Vec<[DVec3; 3]>, Vec<[DVec3; 2]>) {
     // a node of its own or of the solid; ordered, so that nothing depends on hashing
     let mut index: BTreeMap<usize, usize> = cluster.iter().enumerate().map(|(k, &i)| (i, k)).collect();
     let own = cluster.len();
-    let mut positions: Vec<DVec3> = cluster.iter().map(|&i| grid.position(i)).collect();
+    let mut positions: Vec<DVec3> = cluster.iter().map(|&i| complex.positions[i]).collect();
     let mut links: Vec<Vec<usize>> = vec![Vec::new(); own];
+    let mut rings = Rings::new(complex);
     for (k, &i) in cluster.iter().enumerate() {
-        let here = grid.place(i);
-        for j in NEIGHBOURS.into_iter().filter_map(|offset| neighbour(grid, here, offset)) {
+        for j in rings.of(i).nodes.iter().map(|&j| j as usize) {
             let hangs_on = inside[j] && values[j] <= 0.0;
             if !hangs_on && !index.contains_key(&j) {
                 continue;
             }
             let n = *index.entry(j).or_insert_with(|| {
-                positions.push(grid.position(j));
+                positions.push(complex.positions[j]);
                 positions.len() - 1
             });
             links[k].push(n);
         }
     }
     let (mut triangles, mut edges) = (Vec::new(), BTreeMap::new());
-    let steps = &NEIGHBOURS[..7];
     for (&i, &a) in &index {
-        let here = grid.place(i);
-        let next = |offset: IVec3| neighbour(grid, here, offset).and_then(|j| index.get(&j).copied());
-        for &first in steps {
-            let Some(b) = next(first) else { continue };
+        let ring = rings.of(i);
+        let higher: Vec<(usize, usize)> = (0..ring.nodes.len())
+            .filter(|&k| ring.nodes[k] as usize > i)
+            .filter_map(|k| Some((k, *index.get(&(ring.nodes[k] as usize))?)))
+            .collect();
+        for (n, &(j, b)) in higher.iter().enumerate() {
             if a.min(b) < own {
                 edges.entry((a.min(b), a.max(b))).or_insert(true);
             }
-            for &second in steps.iter().filter(|&&second| second != first && (second - first).min_element() >= 0) {
-                let Some(c) = next(second) else { continue };
-                if a.min(b).min(c) < own {
+            for &(k, c) in &higher[n + 1..] {
+                if a.min(b).min(c) < own && ring.links[j] >> k & 1 == 1 {
                     triangles.push([a, b, c]);
                 }
             }

@@ -7,6 +7,7 @@
 //! the point decides. All arithmetic is in `f64` about the center of the mesh; only the given points and the answers are
 //! `f32`.
 
+use super::boundary::boundary;
 use super::closest::{Feature, closest};
 use super::sides::{Sides, classify};
 use super::topology::{NONE, Soundness, normals, orient};
@@ -48,6 +49,8 @@ pub struct MeshField {
     sides: Option<(Vec<Sides>, Vec<Sides>)>,
     /// Built when first asked: most meshes never ask.
     winding: OnceLock<Winding>,
+    /// The part of a mesh that meets itself which bounds the solid; made when first asked.
+    boundary: OnceLock<TriangleMesh>,
 }
 
 /// A triangle about the mesh's center, as the nearest-point search wants it.
@@ -138,6 +141,7 @@ impl MeshField {
             vertex_normals,
             sides,
             winding,
+            boundary: OnceLock::new(),
             mesh,
         })
     }
@@ -206,13 +210,16 @@ impl MeshField {
         }
     }
 
-    /// Whether `p` is inside by the winding number: the surface wraps around it, once or more often, in either sense.
-    fn wrapped(&self, p: DVec3) -> bool {
-        let winding = self.winding.get_or_init(|| {
+    fn winding(&self) -> &Winding {
+        self.winding.get_or_init(|| {
             let vertices: Vec<DVec3> = self.mesh.vertices.iter().map(|&v| DVec3::from(v) - self.center).collect();
             Winding::new(&vertices, &self.mesh.triangles)
-        });
-        winding.number(p).abs() > 0.5
+        })
+    }
+
+    /// Whether `p` is inside by the winding number: the surface wraps around it, once or more often, in either sense.
+    fn wrapped(&self, p: DVec3) -> bool {
+        self.winding().number(p).abs() > 0.5
     }
 
     /// Signed distance and gradient at `p` (in scene units), and the tree's place of the nearest triangle.
@@ -276,8 +283,10 @@ impl Field for MeshField {
             near = found;
         }
     }
+    /// The mesh; of one that meets itself the part that bounds the solid.
     fn truth(&self) -> Option<&TriangleMesh> {
-        Some(&self.mesh)
+        let Some((of_triangles, _)) = &self.sides else { return Some(&self.mesh) };
+        Some(self.boundary.get_or_init(|| boundary(&self.mesh, of_triangles, self.winding(), self.center)))
     }
 }
 

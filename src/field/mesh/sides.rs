@@ -22,7 +22,7 @@ pub(super) enum Sides {
 }
 
 /// A point beside a triangle is off it by this share of the square root of its area.
-const OFF: f64 = 1e-5;
+pub(super) const OFF: f64 = 1e-5;
 /// Triangles of a patch that are tried for a clear answer, the largest first.
 const TRIES: usize = 8;
 /// How far from whole numbers one apart the two winding numbers may be.

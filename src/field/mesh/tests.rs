@@ -377,3 +377,32 @@ fn mesh_query_speed() {
         }
     }
 }
+
+#[test]
+fn what_is_buried_where_a_mesh_meets_itself_is_no_truth() {
+    // two boxes that overlap in a cube of side 1
+    let (mut mesh, other) = (block([-1.0; 3], [1.0; 3]), block([0.0; 3], [2.0; 3]));
+    let first = mesh.vertices.len() as u32;
+    mesh.vertices.extend(other.vertices);
+    mesh.triangles.extend(other.triangles.iter().map(|t| t.map(|v| v + first)));
+    let area = |mesh: &TriangleMesh| -> f64 {
+        let corners = |t: &[u32; 3]| t.map(|v| DVec3::from(mesh.vertices[v as usize]));
+        mesh.triangles.iter().map(corners).map(|[a, b, c]| 0.5 * (b - a).cross(c - a).length()).sum()
+    };
+    assert_eq!(area(&mesh), 48.0);
+    let field = MeshField::new(mesh).unwrap();
+    let truth = field.truth().unwrap();
+    // three unit squares of either box are inside the other
+    assert!((area(truth) - 42.0).abs() < 0.02 * 42.0, "{}", area(truth));
+    assert_eq!(area(field.mesh()), 48.0, "the mesh itself stays whole");
+    let buried = truth.vertices.iter().filter(|v| v.iter().all(|&c| c > 0.3 && c < 0.7)).count();
+    assert_eq!(buried, 0);
+}
+
+/// A box of triangles, two to a side.
+fn block(low: [f64; 3], high: [f64; 3]) -> TriangleMesh {
+    let vertices = (0..8).map(|k| [0, 1, 2].map(|a| if k >> a & 1 == 1 { high[a] } else { low[a] })).collect();
+    let sides = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];
+    let triangles = sides.iter().flat_map(|&[a, b, c, d]| [[a, b, c], [a, c, d]]).collect();
+    TriangleMesh { vertices, triangles }
+}
