@@ -464,8 +464,8 @@ mod tests {
 
     /// A ball with a fin that is a third of a spacing thick.
     fn fin() -> Value {
-        json!({"union": [{"sphere": {"radius": 0.5}},
-            {"translate": {"by": [0.0, 0.0, 0.45], "of": {"box": {"half_extents": [0.3, 0.006, 0.35]}}}}]})
+        json!({"union": {"of": [{"sphere": {"radius": 0.5}},
+            {"translate": {"by": [0.0, 0.0, 0.45], "of": {"box": {"half_extents": [0.3, 0.006, 0.35]}}}}]}})
     }
 
     #[test]
@@ -493,7 +493,7 @@ mod tests {
         let torus = json!({"torus": {"major": 0.6, "minor": 0.2}});
         assert!(matches!(contracted(torus, FIRST, &[]), Err(ShrinkError::Genus { genus: 1, .. })));
         let ball = |x: f64| json!({"translate": {"by": [x, 0, 0], "of": {"sphere": {"radius": 0.25}}}});
-        let two = json!({"union": [ball(-0.5), ball(0.5)]});
+        let two = json!({"union": {"of": [ball(-0.5), ball(0.5)]}});
         assert!(matches!(contracted(two, FIRST, &[]), Err(ShrinkError::Components { count: 2, .. })));
     }
 }
