@@ -1,8 +1,8 @@
 //! Where one attempt at a surface spends its time, stage by stage, outside the field.
 //!
-//!     cargo bench --bench stages -- FIELD... [--threads N] [--runs N] [--octahedral N | --latlong THETAxPHI]
+//!     cargo bench --bench stages -- FIELD... [--threads N] [--runs N] [--octahedral N | --latlong N]
 //!
-//! prints for every field the least seconds over the runs: by the clock on the wall while no thread is in the field, and of
+//! (a lat-long lattice of N rows has 2 N columns) prints for every field the least seconds over the runs: by the clock on the wall while no thread is in the field, and of
 //! processor time of all threads together less what the field used (Linux only). On a machine that others use too only
 //! the second can be compared.
 

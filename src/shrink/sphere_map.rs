@@ -43,11 +43,13 @@ struct Steps {
 }
 const NEWTON: Steps = Steps { work: 10_000, fewest: 2, most: 40 };
 /// A descent at a growth. Far from the minimum a step that is known better is not a longer one: the barriers stop it.
-const COARSE: Effort = Effort { steps: 0, products: 25, tolerance: 1e-3 };
+const COARSE: Effort = Effort { steps: 0, products: 40, tolerance: 1e-3 };
 /// The last descent.
-const FINE: Effort = Effort { steps: 6, products: 30, tolerance: 1e-4 };
+const FINE: Effort = Effort { steps: 8, products: 40, tolerance: 1e-4 };
 /// A new vertex whose energy per area is above this is in trouble, and a growing patch around it is relaxed.
 const TROUBLE: f64 = 100.0;
+/// A new vertex whose energy per area is below this many times the ideal leaves its ring as it is.
+const CALM: f64 = 2.0;
 
 /// The map, and what it cost.
 #[derive(Clone, Debug)]
@@ -264,10 +266,11 @@ impl Inserter<'_> {
     /// Relaxes a vertex that was just inserted, its ring, and a growing patch where that is not enough.
     fn settle(&mut self, v: u32, ring: &[u32], size: usize, cancel: &CancelToken) -> Result<(), Canceled> {
         cancel.check()?;
-        self.relax(v, 2);
-        let rounds = if size < 200 { 3 } else { 1 };
-        let mut energy = f64::INFINITY;
-        for round in 0..80 {
+        let (_, mut energy) = self.relax(v, 2);
+        // the sweeps at the next growth are enough for a ring that is well
+        let calm = size >= SMALL && energy < CALM * self.objective.ideal() * self.star.area();
+        let (rounds, most) = (if size < 200 { 3 } else { 1 }, if calm { 0 } else { 80 });
+        for round in 0..most {
             let around: f64 = ring.iter().map(|&u| self.relax(u, 1).0).sum();
             let (fallen, left) = self.relax(v, 1);
             energy = left;

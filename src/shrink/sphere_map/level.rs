@@ -11,9 +11,10 @@ use rayon::prelude::*;
 
 /// Vertices per piece of parallel work; fixed, so that sums do not depend on the number of threads.
 pub const CHUNK: usize = 512;
-/// Meshes below this many vertices are not worth waking threads for: for lists whose items take long, and for the rest.
-const WORTHWHILE: usize = 1024;
+/// Meshes below this many vertices are not worth waking threads for.
 pub const PARALLEL: usize = 4096;
+/// The same for lists whose items take long to make.
+const PARALLEL_LISTS: usize = 1024;
 
 /// A corner of a triangle. Triangles are numbered by their smallest vertex, which is their corner 0, and its ring.
 #[derive(Clone, Copy)]
@@ -162,7 +163,7 @@ impl Level {
             out
         };
         let starts = || (0..self.len()).step_by(CHUNK);
-        if self.len() < WORTHWHILE {
+        if self.len() < PARALLEL_LISTS {
             return starts().flat_map(piece).collect();
         }
         let starts: Vec<usize> = starts().collect();
@@ -172,7 +173,7 @@ impl Level {
 
     /// A list made piece by piece.
     pub fn map<T: Send>(&self, count: usize, settings: &Settings<'_>, item: impl Fn(usize) -> T + Sync) -> Vec<T> {
-        if self.len() < WORTHWHILE {
+        if self.len() < PARALLEL_LISTS {
             return (0..count).map(item).collect();
         }
         settings.pool.install(|| (0..count).into_par_iter().with_min_len(CHUNK).map(&item).collect())
