@@ -5,7 +5,7 @@ use crate::settings::{Canceled, Settings};
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
-/// Triangles per piece of a parallel search; fixed, so that the result does not depend on the number of threads.
+/// Nodes of the hierarchy per piece of a parallel search; fixed, so that the result does not depend on the number of threads.
 const CHUNK: usize = 256;
 /// Triangles in a leaf of the hierarchy.
 const LEAF: usize = 4;
@@ -148,23 +148,33 @@ pub fn crossings(
     for &t in asked {
         among[t as usize] = true;
     }
-    let search = |piece: &[u32]| {
+    let search = |piece: &[Node]| {
         settings.cancel.check()?;
-        let mut hits = Vec::new();
-        for &i in piece {
-            let t = triangles[i as usize];
-            index.near(index.bounds(i), |j| {
-                // of two that are both asked about the first one finds the pair
-                let mine = j > i || !among[j as usize];
-                if mine && meet(positions, t, triangles[j as usize]) {
-                    hits.push((i.min(j), i.max(j)));
+        let (mut near, mut hits) = (Vec::new(), Vec::new());
+        for leaf in piece {
+            let items = &index.order[leaf.items.0 as usize..leaf.items.1 as usize];
+            if items.iter().all(|&i| !among[i as usize]) {
+                continue;
+            }
+            // one walk for all of a leaf
+            near.clear();
+            index.near(&leaf.bounds, |j| near.push(j));
+            for &i in items.iter().filter(|&&i| among[i as usize]) {
+                let t = triangles[i as usize];
+                for &j in &near {
+                    // of two that are both asked about the first one finds the pair
+                    let mine = j > i || (j < i && !among[j as usize]);
+                    let close = mine && index.boxes[j as usize].meets(&index.boxes[i as usize]);
+                    if close && meet(positions, t, triangles[j as usize]) {
+                        hits.push((i.min(j), i.max(j)));
+                    }
                 }
-            });
+            }
         }
         Ok(hits)
     };
     let pieces: Result<Vec<Vec<(u32, u32)>>, Canceled> =
-        settings.pool.install(|| asked.par_chunks(CHUNK).map(search).collect());
+        settings.pool.install(|| index.nodes.par_chunks(CHUNK).map(search).collect());
     let mut pairs = pieces?.concat();
     pairs.sort_unstable();
     Ok(pairs)

@@ -1,7 +1,7 @@
 //! The distortion energy of one triangle against a reference triangle, and the two-dimensional Newton step both the sphere
 //! map and the untangling take.
 
-use glam::{DMat3, DVec2, DVec3};
+use glam::{DMat2, DMat3, DVec2, DVec3};
 
 /// A reference triangle: its area and the cotangents at its three corners, which give the Dirichlet energy of a map from
 /// it (Pinkall and Polthier 1993).
@@ -31,6 +31,12 @@ impl Reference {
             area,
             cotangents: [cotangent(l[0], l[1], l[2]), cotangent(l[1], l[2], l[0]), cotangent(l[2], l[0], l[1])],
         }
+    }
+
+    /// The same triangle seen from another of its corners.
+    pub fn turned(&self, corner: usize) -> Self {
+        let k = self.cotangents;
+        Self { area: self.area, cotangents: [0, 1, 2].map(|i| k[(corner + i) % 3]) }
     }
 
     /// The equilateral triangle of this edge length.
@@ -131,24 +137,41 @@ pub fn tangents(n: DVec3) -> (DVec3, DVec3) {
 /// Newton direction in the plane of `e1, e2` with the Hessian's eigenvalues made positive; `shift` is added to the
 /// Hessian's diagonal (the curvature of a sphere the point stays on).
 pub fn newton_direction(gradient: DVec3, hessian: &DMat3, shift: f64, e1: DVec3, e2: DVec3) -> DVec3 {
-    /// Smallest eigenvalue kept, relative to the largest.
-    const FLOOR: f64 = 1e-3;
     let (h1, h2) = (*hessian * e1, *hessian * e2);
     let g = DVec2::new(gradient.dot(e1), gradient.dot(e2));
-    let (a, b, c) = (e1.dot(h1) + shift, e1.dot(h2), e2.dot(h2) + shift);
+    let step = planar_newton_step(g, e1.dot(h1) + shift, e1.dot(h2), e2.dot(h2) + shift);
+    e1 * step.x + e2 * step.y
+}
+
+/// Newton step in a plane with the Hessian `[a b; b c]`, its eigenvalues made positive.
+pub fn planar_newton_step(gradient: DVec2, a: f64, b: f64, c: f64) -> DVec2 {
+    let inverse = inverse_positive(a, b, c);
+    -(inverse * gradient)
+}
+
+/// The inverse of the symmetric matrix `[a b; b c]` with its eigenvalues made positive and none much smaller than the
+/// other.
+pub fn inverse_positive(a: f64, b: f64, c: f64) -> DMat2 {
+    /// Smallest eigenvalue kept, relative to the largest.
+    const FLOOR: f64 = 1e-3;
     let (mean, radius) = (0.5 * (a + c), (0.25 * (a - c) * (a - c) + b * b).sqrt());
-    let (small, large) = (mean - radius, mean + radius);
-    let floor = FLOOR * small.abs().max(large.abs()) + 1e-300;
-    let axis = if b.abs() > 1e-300 {
+    let (large, small) = (mean + radius, mean - radius);
+    let floor = FLOOR * large.abs().max(small.abs()) + 1e-300;
+    let axis = larger_axis(a, b, c, large);
+    let across = axis.perp();
+    let (l, s) = (1.0 / large.abs().max(floor), 1.0 / small.abs().max(floor));
+    DMat2::from_cols(l * axis * axis.x + s * across * across.x, l * axis * axis.y + s * across * across.y)
+}
+
+/// Unit eigenvector of the symmetric matrix `[a b; b c]` for its larger eigenvalue.
+pub fn larger_axis(a: f64, b: f64, c: f64, large: f64) -> DVec2 {
+    if b.abs() > 1e-300 {
         DVec2::new(large - c, b).normalize_or(DVec2::X)
     } else if a >= c {
         DVec2::X
     } else {
         DVec2::Y
-    };
-    let across = axis.perp();
-    let step = axis * (-g.dot(axis) / large.abs().max(floor)) + across * (-g.dot(across) / small.abs().max(floor));
-    e1 * step.x + e2 * step.y
+    }
 }
 
 /// Adds `weight * u v^T` to `m`.

@@ -42,12 +42,14 @@ struct Steps {
     most: usize,
 }
 const NEWTON: Steps = Steps { work: 10_000, fewest: 2, most: 40 };
-/// A descent at a growth.
-const COARSE: Effort = Effort { steps: 0, products: 60, tolerance: 1e-3 };
+/// A descent at a growth. Far from the minimum a step that is known better is not a longer one: the barriers stop it.
+const COARSE: Effort = Effort { steps: 0, products: 40, tolerance: 1e-3 };
 /// The last descent.
-const FINE: Effort = Effort { steps: 6, products: 60, tolerance: 1e-4 };
+const FINE: Effort = Effort { steps: 8, products: 40, tolerance: 1e-4 };
 /// A new vertex whose energy per area is above this is in trouble, and a growing patch around it is relaxed.
 const TROUBLE: f64 = 100.0;
+/// A new vertex whose energy per area is below this many times the ideal leaves its ring as it is.
+const CALM: f64 = 2.0;
 
 /// The map, and what it cost.
 #[derive(Clone, Debug)]
@@ -200,16 +202,17 @@ impl Inserter<'_> {
         }
     }
 
-    /// One Newton step of one vertex; returns by how much the energy of its star fell.
-    fn relax(&mut self, v: u32) -> f64 {
+    /// Newton steps of one vertex; returns by how much the energy of its star fell, and that energy.
+    fn relax(&mut self, v: u32, steps: usize) -> (f64, f64) {
         self.gather(v);
-        match self.star.relax(self.directions[v as usize], &self.objective) {
-            Some((to, fallen)) => {
-                self.directions[v as usize] = to;
-                fallen
-            }
-            None => 0.0,
+        let (mut fallen, mut energy) = (0.0, None);
+        for _ in 0..steps {
+            let Some(step) = self.star.relax(self.directions[v as usize], &self.objective) else { break };
+            self.directions[v as usize] = step.to;
+            fallen += step.before - step.after;
+            energy = Some(step.after);
         }
+        (fallen, energy.unwrap_or_else(|| self.star.energy(self.directions[v as usize], &self.objective)))
     }
 
     /// Energy and reference area of the star of `v`.
@@ -263,19 +266,20 @@ impl Inserter<'_> {
     /// Relaxes a vertex that was just inserted, its ring, and a growing patch where that is not enough.
     fn settle(&mut self, v: u32, ring: &[u32], size: usize, cancel: &CancelToken) -> Result<(), Canceled> {
         cancel.check()?;
-        self.relax(v);
-        self.relax(v);
-        let rounds = if size < 200 { 3 } else { 1 };
-        for round in 0..80 {
-            let fallen: f64 = ring.iter().map(|&u| self.relax(u)).sum::<f64>() + self.relax(v);
-            if round + 1 >= rounds {
-                let (energy, _) = self.star_energy(v);
-                if energy.is_finite() && fallen < 0.05 * energy {
-                    break;
-                }
+        let (_, mut energy) = self.relax(v, 2);
+        // the sweeps at the next growth are enough for a ring that is well
+        let calm = size >= SMALL && energy < CALM * self.objective.ideal() * self.star.area();
+        let (rounds, most) = (if size < 200 { 3 } else { 1 }, if calm { 0 } else { 80 });
+        for round in 0..most {
+            let around: f64 = ring.iter().map(|&u| self.relax(u, 1).0).sum();
+            let (fallen, left) = self.relax(v, 1);
+            energy = left;
+            if round + 1 >= rounds && energy.is_finite() && around + fallen < 0.05 * energy {
+                break;
             }
         }
-        let (energy, area) = self.star_energy(v);
+        // the star is still that of `v`
+        let area = self.star.area();
         if energy < TROUBLE * area {
             return Ok(());
         }
@@ -301,7 +305,7 @@ impl Inserter<'_> {
             for round in 0..40 {
                 cancel.check()?;
                 for i in 0..patch.len() {
-                    self.relax(if round % 2 == 0 { patch[i] } else { patch[patch.len() - 1 - i] });
+                    self.relax(if round % 2 == 0 { patch[i] } else { patch[patch.len() - 1 - i] }, 1);
                 }
                 let (energy, _) = self.star_energy(v);
                 if energy < 0.3 * TROUBLE * area || (energy > 0.98 * last && round > 4) {

@@ -53,40 +53,77 @@ impl Quadric {
     }
 }
 
-/// Collapses to four vertices, cheapest half-edge first (quadric plus squared length, worse for slivers, folds and high
-/// valence). `None` when that is impossible.
-pub fn decimate(mesh: &Mesh, rings: &mut Rings, cancel: &CancelToken) -> Result<Option<Vec<Collapse>>, Canceled> {
-    let n = mesh.positions.len();
-    let (mut quadrics, mut area) = (vec![Quadric::default(); n], 0.0);
-    for t in mesh.rings.triangles() {
-        let normal = mesh.normal(t);
-        let a = 0.5 * normal.length();
-        area += a;
-        for v in t {
-            quadrics[v as usize].add_plane(normal.normalize_or_zero(), mesh.positions[t[0] as usize], a);
+/// Costs of collapsing a vertex into each of its neighbours, with what is needed to compute them.
+struct Costs<'a> {
+    mesh: &'a Mesh,
+    quadrics: Vec<Quadric>,
+    /// Weight of an edge's squared length.
+    length_weight: f64,
+    /// Area vectors, twice, of the triangles around the vertex; reused.
+    normals: Vec<DVec3>,
+    /// Cost and neighbour; reused.
+    choices: Vec<(f64, u32)>,
+}
+
+impl<'a> Costs<'a> {
+    fn new(mesh: &'a Mesh) -> Self {
+        let n = mesh.positions.len();
+        let (mut quadrics, mut area) = (vec![Quadric::default(); n], 0.0);
+        for t in mesh.rings.triangles() {
+            let normal = mesh.normal(t);
+            let a = 0.5 * normal.length();
+            area += a;
+            for v in t {
+                quadrics[v as usize].add_plane(normal.normalize_or_zero(), mesh.positions[t[0] as usize], a);
+            }
         }
+        Self { mesh, quadrics, length_weight: area / n as f64, normals: Vec::new(), choices: Vec::new() }
     }
-    let length_weight = area / n as f64;
-    let cost = |rings: &Rings, quadrics: &[Quadric], v: u32, w: u32| -> f64 {
-        let to = mesh.positions[w as usize];
-        let mut quadric = quadrics[v as usize];
-        quadric.add(&quadrics[w as usize]);
-        let ring = rings.ring(v);
+
+    /// The cheapest neighbour that `v` can be collapsed into.
+    fn cheapest(&mut self, rings: &Rings, v: u32) -> Option<(f64, u32)> {
+        let (ring, positions) = (rings.ring(v), &self.mesh.positions);
+        let next = |i: usize| if i + 1 < ring.len() { ring[i + 1] } else { ring[0] };
+        self.normals.clear();
+        self.normals.extend((0..ring.len()).map(|i| self.mesh.normal([v, ring[i], next(i)])));
+        self.choices.clear();
+        for k in 0..ring.len() {
+            let cost = self.cost(rings, v, ring[k], positions[ring[k] as usize]);
+            self.choices.push((cost, ring[k]));
+        }
+        // few neighbours are not collapsible, and to know it takes longer than to know the cost
+        while let Some(k) = (0..self.choices.len()).min_by(|&a, &b| self.choices[a].0.total_cmp(&self.choices[b].0)) {
+            if rings.collapsible(v, self.choices[k].1) {
+                return Some(self.choices[k]);
+            }
+            self.choices.swap_remove(k);
+        }
+        None
+    }
+
+    /// Quadric plus squared length, worse for slivers, folds and high valence.
+    fn cost(&self, rings: &Rings, v: u32, w: u32, to: DVec3) -> f64 {
+        /// A triangle that turns by more than the angle of this cosine is folded.
+        const TURN: f64 = 0.2;
+        let (ring, positions) = (rings.ring(v), &self.mesh.positions);
+        // the largest squared ratio of edges to area, and 1 for an equilateral triangle
         let (mut aspect, mut folds) = (1.0f64, 0);
         for (i, &a) in ring.iter().enumerate() {
-            let b = ring[(i + 1) % ring.len()];
+            let b = if i + 1 < ring.len() { ring[i + 1] } else { ring[0] };
             if a == w || b == w {
                 continue;
             }
-            let (pa, pb) = (mesh.positions[a as usize], mesh.positions[b as usize]);
-            let (after, before) = ((pa - to).cross(pb - to), mesh.normal([v, a, b]));
-            let edges = pa.distance_squared(pb) + pa.distance_squared(to) + pb.distance_squared(to);
-            // 1 for an equilateral triangle
-            aspect = aspect.max(edges / (12f64.sqrt() * after.length()).max(1e-9 * edges));
-            folds += i32::from(before.dot(after) < 0.2 * before.length() * after.length());
+            let (pa, pb) = (positions[a as usize] - to, positions[b as usize] - to);
+            let (after, before) = (pa.cross(pb), self.normals[i]);
+            let edges = pa.distance_squared(pb) + pa.length_squared() + pb.length_squared();
+            let (squared, edges) = (after.length_squared(), edges * edges);
+            aspect = aspect.max(edges / (12.0 * squared).max(1e-18 * edges));
+            let along = before.dot(after);
+            folds += i32::from(along < 0.0 || along * along < TURN * TURN * before.length_squared() * squared);
         }
-        let squared = to.distance_squared(mesh.positions[v as usize]);
-        let mut cost = (quadric.at(to).max(0.0) + length_weight * squared) * (1.0 + 0.1 * aspect.min(100.0));
+        let squared = to.distance_squared(positions[v as usize]);
+        let quadric = self.quadrics[v as usize].at(to) + self.quadrics[w as usize].at(to);
+        let mut cost = (quadric.max(0.0) + self.length_weight * squared) * (1.0 + 0.1 * aspect.sqrt().min(100.0));
         let merged = ring.len() + rings.valence(w) - 4;
         for valence in [merged, ring.len()] {
             if valence > 9 {
@@ -97,12 +134,18 @@ pub fn decimate(mesh: &Mesh, rings: &mut Rings, cancel: &CancelToken) -> Result<
             cost *= 50.0 * f64::from(1 + folds);
         }
         cost + 1e-30 * squared
-    };
-    let cheapest = |rings: &Rings, quadrics: &[Quadric], v: u32| -> Option<(f64, u32)> {
-        let choices = rings.ring(v).iter().filter(|&&w| rings.collapsible(v, w));
-        choices.map(|&w| (cost(rings, quadrics, v, w), w)).min_by(|a, b| a.0.total_cmp(&b.0))
-    };
-    let (mut stamps, mut targets) = (vec![0u32; n], vec![u32::MAX; n]);
+    }
+}
+
+/// Collapses to four vertices, about the cheapest half-edge first: a vertex whose surroundings have changed is looked at
+/// again when its turn comes, for most changes make it dearer. `None` when that is impossible.
+pub fn decimate(mesh: &Mesh, rings: &mut Rings, cancel: &CancelToken) -> Result<Option<Vec<Collapse>>, Canceled> {
+    let n = mesh.positions.len();
+    let mut costs = Costs::new(mesh);
+    /// Target of a vertex that waits for its surroundings to change, because it cannot be collapsed as they are.
+    const NONE: u32 = u32::MAX;
+    // a candidate whose stamp is not its vertex's own is out of date
+    let (mut stamps, mut targets, mut stale) = (vec![0u32; n], vec![NONE; n], vec![false; n]);
     let mut heap = BinaryHeap::new();
     let mut log = Vec::with_capacity(n);
     let mut alive = (0..n as u32).filter(|&v| rings.alive(v)).count();
@@ -119,7 +162,9 @@ pub fn decimate(mesh: &Mesh, rings: &mut Rings, cancel: &CancelToken) -> Result<
                     cancel.check()?;
                 }
                 stamps[v as usize] += 1;
-                if let Some((cost, w)) = cheapest(rings, &quadrics, v) {
+                stale[v as usize] = false;
+                targets[v as usize] = NONE;
+                if let Some((cost, w)) = costs.cheapest(rings, v) {
                     targets[v as usize] = w;
                     heap.push(Candidate { cost, vertex: v, stamp: stamps[v as usize] });
                 }
@@ -130,23 +175,29 @@ pub fn decimate(mesh: &Mesh, rings: &mut Rings, cancel: &CancelToken) -> Result<
             continue;
         }
         let w = targets[v as usize];
-        let mut touched = vec![v];
-        if rings.joined(v, w) && rings.collapsible(v, w) {
-            log.push((v, rings.collapse(v, w)));
-            let gone = quadrics[v as usize];
-            quadrics[w as usize].add(&gone);
-            alive -= 1;
-            if alive.is_multiple_of(256) {
-                cancel.check()?;
+        if stale[v as usize] || !rings.joined(v, w) || !rings.collapsible(v, w) {
+            stamps[v as usize] += 1;
+            stale[v as usize] = false;
+            targets[v as usize] = NONE;
+            if let Some((cost, x)) = costs.cheapest(rings, v) {
+                targets[v as usize] = x;
+                heap.push(Candidate { cost, vertex: v, stamp: stamps[v as usize] });
             }
-            touched = rings.ring(w).to_vec();
-            touched.push(w);
+            continue;
         }
-        for u in touched {
-            stamps[u as usize] += 1;
-            if let Some((cost, x)) = cheapest(rings, &quadrics, u) {
-                targets[u as usize] = x;
-                heap.push(Candidate { cost, vertex: u, stamp: stamps[u as usize] });
+        log.push((v, rings.collapse(v, w)));
+        let gone = costs.quadrics[v as usize];
+        costs.quadrics[w as usize].add(&gone);
+        alive -= 1;
+        if alive.is_multiple_of(256) {
+            cancel.check()?;
+        }
+        for &u in rings.ring(w).iter().chain([&w]) {
+            stale[u as usize] = true;
+            if targets[u as usize] == NONE {
+                targets[u as usize] = w;
+                stamps[u as usize] += 1;
+                heap.push(Candidate { cost: 0.0, vertex: u, stamp: stamps[u as usize] });
             }
         }
     }

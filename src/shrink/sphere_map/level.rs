@@ -4,7 +4,7 @@
 //! does not depend on who computes which, and no triangle turns over.
 
 use super::super::energy::{Objective, Reference};
-use super::star::Star;
+use super::star::{POSITIVE, Relaxed, Star};
 use crate::settings::{Canceled, Settings};
 use glam::DVec3;
 use rayon::prelude::*;
@@ -13,6 +13,8 @@ use rayon::prelude::*;
 pub const CHUNK: usize = 512;
 /// Meshes below this many vertices are not worth waking threads for.
 pub const PARALLEL: usize = 4096;
+/// The same for lists whose items take long to make.
+const PARALLEL_LISTS: usize = 1024;
 
 /// A corner of a triangle. Triangles are numbered by their smallest vertex, which is their corner 0, and its ring.
 #[derive(Clone, Copy)]
@@ -34,7 +36,11 @@ pub struct Level {
     /// Reference of the triangle between a ring's entry and the next one, seen from the ring's vertex.
     pub references: Vec<Reference>,
     /// Which triangle that is, and which of its corners the vertex is.
-    pub triangles: Vec<Place>,
+    pub places: Vec<Place>,
+    /// Corners of every triangle, the smallest vertex first.
+    pub triangles: Vec<[u32; 3]>,
+    /// Reference of every triangle, seen from its first corner.
+    pub shapes: Vec<Reference>,
     /// Vertices by colour.
     colours: Vec<Vec<u32>>,
 }
@@ -59,16 +65,23 @@ impl Level {
             ring.extend(ring_of(v).iter().map(|&u| number[u as usize]));
             first.push(ring.len() as u32);
         }
-        let mut level =
-            Self { vertices, first, ring, references: Vec::new(), triangles: Vec::new(), colours: Vec::new() };
-        level.references = level.map_rows(settings, |v, out| {
-            let (here, ring) = (level.vertices[v], level.ring(v));
-            for i in 0..ring.len() {
-                let (b, c) = (ring[i] as usize, ring[(i + 1) % ring.len()] as usize);
-                out.push(reference([here, level.vertices[b], level.vertices[c]]));
-            }
-        });
+        let mut level = Self {
+            vertices,
+            first,
+            ring,
+            references: Vec::new(),
+            places: Vec::new(),
+            triangles: Vec::new(),
+            shapes: Vec::new(),
+            colours: Vec::new(),
+        };
         level.number_triangles();
+        level.shapes = level.map(level.triangles.len(), settings, |t| {
+            reference(level.triangles[t].map(|v| level.vertices[v as usize]))
+        });
+        let shapes = &level.shapes;
+        level.references =
+            level.places.iter().map(|at| shapes[at.triangle as usize].turned(at.corner.into())).collect();
         level.colour();
         level
     }
@@ -95,12 +108,12 @@ impl Level {
     fn number_triangles(&mut self) {
         const OTHERS: u32 = u32::MAX;
         let mut places = vec![Place { triangle: OTHERS, corner: 0 }; self.ring.len()];
-        let mut count = 0;
+        let mut triangles = Vec::with_capacity(self.ring.len() / 3);
         for v in 0..self.len() {
             for (slot, [b, c]) in self.range(v).zip(self.wedges(v)) {
                 if v < b && v < c {
-                    places[slot].triangle = count;
-                    count += 1;
+                    places[slot].triangle = triangles.len() as u32;
+                    triangles.push([v, b, c].map(|u| u as u32));
                 }
             }
         }
@@ -115,7 +128,7 @@ impl Level {
                 }
             }
         }
-        self.triangles = places;
+        (self.places, self.triangles) = (places, triangles);
     }
 
     /// The first colour that no neighbour has, vertex by vertex.
@@ -150,7 +163,7 @@ impl Level {
             out
         };
         let starts = || (0..self.len()).step_by(CHUNK);
-        if self.len() < PARALLEL {
+        if self.len() < PARALLEL_LISTS {
             return starts().flat_map(piece).collect();
         }
         let starts: Vec<usize> = starts().collect();
@@ -158,10 +171,18 @@ impl Level {
         pieces.into_iter().flatten().collect()
     }
 
-    /// A sum over all vertices, in a fixed order.
-    pub fn sum(&self, settings: &Settings<'_>, term: impl Fn(usize) -> f64 + Sync) -> f64 {
-        let piece = |start: usize| (start..(start + CHUNK).min(self.len())).map(&term).sum::<f64>();
-        let starts = (0..self.len()).step_by(CHUNK);
+    /// A list made piece by piece.
+    pub fn map<T: Send>(&self, count: usize, settings: &Settings<'_>, item: impl Fn(usize) -> T + Sync) -> Vec<T> {
+        if self.len() < PARALLEL_LISTS {
+            return (0..count).map(item).collect();
+        }
+        settings.pool.install(|| (0..count).into_par_iter().with_min_len(CHUNK).map(&item).collect())
+    }
+
+    /// A sum in a fixed order.
+    pub fn sum(&self, count: usize, settings: &Settings<'_>, term: impl Fn(usize) -> f64 + Sync) -> f64 {
+        let piece = |start: usize| (start..(start + CHUNK).min(count)).map(&term).sum::<f64>();
+        let starts = (0..count).step_by(CHUNK);
         if self.len() < PARALLEL {
             return starts.map(piece).sum();
         }
@@ -181,22 +202,13 @@ impl Level {
 
     /// Energy of the whole map; infinite where a triangle is not positive.
     pub fn energy(&self, places: &[DVec3], objective: &Objective, settings: &Settings<'_>) -> f64 {
-        // every triangle is counted at its corner of the smallest number
-        self.sum(settings, |v| {
-            let (ring, references, x) = (self.ring(v), &self.references[self.range(v)], places[v]);
-            let mut sum = 0.0;
-            for i in 0..ring.len() {
-                let (b, c) = (ring[i] as usize, ring[(i + 1) % ring.len()] as usize);
-                if v < b && v < c {
-                    let (b, c) = (places[b], places[c]);
-                    let d = x.dot(b.cross(c)) / (2.0 * references[i].area);
-                    if d.is_nan() || d <= 1e-14 {
-                        return f64::INFINITY;
-                    }
-                    sum += references[i].area * objective.value(references[i].dirichlet(x, b, c), d);
-                }
+        self.sum(self.triangles.len(), settings, |t| {
+            let ([x, b, c], shape) = (self.triangles[t].map(|v| places[v as usize]), &self.shapes[t]);
+            let d = x.dot(b.cross(c)) / (2.0 * shape.area);
+            if d.is_nan() || d <= POSITIVE {
+                return f64::INFINITY;
             }
-            sum
+            shape.area * objective.value(shape.dirichlet(x, b, c), d)
         })
     }
 
@@ -209,7 +221,7 @@ impl Level {
                 self.gather(v as usize, places, star);
                 star.relax(places[v as usize], objective)
             };
-            let steps: Vec<Option<(DVec3, f64)>> = if self.len() < PARALLEL || colour.len() < 2 * CHUNK {
+            let steps: Vec<Option<Relaxed>> = if self.len() < PARALLEL || colour.len() < 2 * CHUNK {
                 let mut star = Star::default();
                 colour.iter().map(|&v| relax(&mut star, v)).collect()
             } else {
@@ -217,9 +229,10 @@ impl Level {
                 settings.pool.install(|| work.map_init(Star::default, |star, &v| relax(star, v)).collect())
             };
             for (&v, step) in colour.iter().zip(steps) {
-                if let Some((to, gain)) = step {
-                    places[v as usize] = to;
-                    fallen += gain;
+                if let Some(step) = step {
+                    places[v as usize] = step.to;
+                    // an energy that was infinite falls by infinity
+                    fallen += step.before - step.after;
                 }
             }
         }

@@ -4,10 +4,10 @@
 //! Vertex sweeps take rough errors away and leave smooth ones; a Newton step sees the whole map and takes both. The energy
 //! is infinite where a triangle is not positive, so the line search keeps the bijection.
 
-use super::super::energy::{Objective, Reference, tangents};
+use super::super::energy::{Objective, Reference, inverse_positive, larger_axis, tangents};
 use super::level::{CHUNK, Level, PARALLEL};
 use crate::settings::{Canceled, Settings};
-use glam::{DMat2, DVec2, DVec3};
+use glam::{DMat2, DVec2, DVec3, Mat2};
 use rayon::prelude::*;
 
 /// When to stop a descent.
@@ -37,17 +37,15 @@ pub struct Descent {
 /// The Hessian at a map, in tangent coordinates: a 2 x 2 block per vertex and per edge, and the gradient.
 struct System {
     frames: Vec<[DVec3; 2]>,
-    nodes: Vec<Node>,
-    /// Blocks of every vertex against its ring, in the ring's order.
-    edges: Vec<DMat2>,
-}
-
-/// One vertex's share of a [`System`].
-struct Node {
-    gradient: DVec2,
-    diagonal: DMat2,
-    /// Inverse of the diagonal block with its eigenvalues made positive.
-    inverse: DMat2,
+    gradients: Vec<DVec2>,
+    /// Inverses of the diagonal blocks with their eigenvalues made positive.
+    inverses: Vec<DMat2>,
+    /// Blocks of every vertex against itself, rounded: products with them are bound by memory, and a direction of descent
+    /// needs few digits.
+    diagonal: Vec<Mat2>,
+    /// Blocks of every vertex against its ring, in the ring's order. That of `v` against `u` is rounded as that of `u`
+    /// against `v` is, so the matrix stays symmetric.
+    edges: Vec<Mat2>,
 }
 
 /// Takes Newton steps until the energy that is left to gain is small, each followed by a sweep of vertex steps. The energy
@@ -65,7 +63,7 @@ pub fn descend(
         let system = System::new(level, places, objective, settings);
         let (direction, used) = system.solve(level, effort.products, settings)?;
         descent.products += used;
-        let slope: f64 = level.sum(settings, |v| system.nodes[v].gradient.dot(direction[v]));
+        let slope: f64 = level.sum(level.len(), settings, |v| system.gradients[v].dot(direction[v]));
         descent.decrement = -0.5 * slope / descent.energy;
         if slope.is_nan() || slope >= 0.0 || descent.decrement < effort.tolerance {
             break;
@@ -98,32 +96,31 @@ fn search(
     /// Rounds of local halving.
     const ROUNDS: usize = 8;
     let mut fractions = vec![1.0f64; level.len()];
-    let step = |fractions: &[f64]| -> Vec<DVec3> {
-        let to = |v: usize| {
-            let [e1, e2] = system.frames[v];
-            (places[v] + fractions[v] * (direction[v].x * e1 + direction[v].y * e2)).normalize_or_zero()
-        };
-        (0..level.len()).map(to).collect()
+    let step = |v: usize, fraction: f64| {
+        let [e1, e2] = system.frames[v];
+        (places[v] + fraction * (direction[v].x * e1 + direction[v].y * e2)).normalize_or_zero()
     };
+    let determinant = |places: &[DVec3], t: usize| {
+        let [a, b, c] = level.triangles[t].map(|v| places[v as usize]);
+        a.dot(b.cross(c))
+    };
+    let count = level.triangles.len();
+    let before = level.map(count, settings, |t| determinant(places, t));
     for _ in 0..10 {
-        let mut to = step(&fractions);
+        let mut to = level.map(level.len(), settings, |v| step(v, fractions[v]));
         for _ in 0..ROUNDS {
-            let flat = |v: usize, b: usize, c: usize| {
-                let after = to[v].dot(to[b].cross(to[c]));
-                after.is_nan() || after < KEPT * places[v].dot(places[b].cross(places[c]))
-            };
-            let squeezed: Vec<u32> = level.map_rows(settings, |v, out| {
-                if level.wedges(v).any(|[b, c]| flat(v, b, c)) {
-                    out.push(v as u32);
-                }
-            });
+            let kept = level.map(count, settings, |t| determinant(&to, t) >= KEPT * before[t]);
+            let flat = (0..count).filter(|&t| !kept[t]);
+            let mut squeezed: Vec<u32> = flat.flat_map(|t| level.triangles[t]).collect();
             if squeezed.is_empty() {
                 break;
             }
-            for &v in &squeezed {
+            squeezed.sort_unstable();
+            squeezed.dedup();
+            for v in squeezed {
                 fractions[v as usize] *= 0.5;
+                to[v as usize] = step(v as usize, fractions[v as usize]);
             }
-            to = step(&fractions);
         }
         let after = level.energy(&to, objective, settings);
         if after < energy {
@@ -136,16 +133,13 @@ fn search(
 
 impl System {
     fn new(level: &Level, places: &[DVec3], objective: &Objective, settings: &Settings<'_>) -> Self {
-        let frames: Vec<[DVec3; 2]> = places.iter().map(|&x| tangents(x).into()).collect();
-        let triangles = level.map_rows(settings, |v, out: &mut Vec<Triangle>| {
-            for (i, [b, c]) in level.wedges(v).enumerate().filter(|&(_, [b, c])| v < b && v < c) {
-                let reference = &level.references[level.range(v)][i];
-                out.push(Triangle::new([v, b, c], places, &frames, reference, objective));
-            }
+        let frames: Vec<[DVec3; 2]> = level.map(level.len(), settings, |v| tangents(places[v]).into());
+        let triangles = level.map(level.triangles.len(), settings, |t| {
+            Triangle::new(level.triangles[t].map(|v| v as usize), places, &frames, &level.shapes[t], objective)
         });
         // every triangle that a vertex is at, turned to start there
         let around = |v: usize| {
-            level.triangles[level.range(v)]
+            level.places[level.range(v)]
                 .iter()
                 .map(|place| (&triangles[place.triangle as usize], place.corner as usize))
         };
@@ -154,26 +148,34 @@ impl System {
             for (t, corner) in around(v) {
                 gradient += t.gradient[corner];
                 inward += t.inward[corner];
-                for mode in &t.modes {
-                    diagonal += outer(mode[corner], mode[corner]);
-                }
+                diagonal += t.own[corner];
             }
             // the sphere's own curvature, where it does not bend the energy downwards
             diagonal += DMat2::from_diagonal(DVec2::splat(f64::max(inward, 0.0)));
-            out.push(Node { gradient, diagonal, inverse: inverse_positive(diagonal) });
+            let inverse = inverse_positive(diagonal.x_axis.x, diagonal.y_axis.x, diagonal.y_axis.y);
+            out.push(Node { gradient, inverse, diagonal: diagonal.as_mat2() });
         });
-        let edges = level.map_rows(settings, |v, out: &mut Vec<DMat2>| {
-            let (start, valence) = (out.len(), level.range(v).len());
-            out.resize(start + valence, DMat2::ZERO);
-            for (i, (t, corner)) in around(v).enumerate() {
-                for mode in &t.modes {
-                    let [x, b, c] = [0, 1, 2].map(|k| mode[(corner + k) % 3]);
-                    out[start + i] += outer(x, b);
-                    out[start + (i + 1) % valence] += outer(x, c);
-                }
+        let edges = level.map_rows(settings, |v, out: &mut Vec<Mat2>| {
+            // the edge to a ring's entry has a triangle on either side: the one from there on, and the one before
+            let mut last = around(v).last().map_or(DMat2::ZERO, |(t, corner)| t.before(corner));
+            for (t, corner) in around(v) {
+                out.push((last + t.after(corner)).as_mat2());
+                last = t.before(corner);
             }
         });
-        Self { frames, nodes, edges }
+        let mut system = Self {
+            frames,
+            gradients: Vec::with_capacity(nodes.len()),
+            inverses: Vec::with_capacity(nodes.len()),
+            diagonal: Vec::with_capacity(nodes.len()),
+            edges,
+        };
+        for node in nodes {
+            system.gradients.push(node.gradient);
+            system.inverses.push(node.inverse);
+            system.diagonal.push(node.diagonal);
+        }
+        system
     }
 
     /// Hessian times `p`; returns the product of both.
@@ -183,9 +185,9 @@ impl System {
             for (i, y) in out.iter_mut().enumerate() {
                 let v = k * CHUNK + i;
                 let range = level.range(v);
-                let mut sum = self.nodes[v].diagonal * p[v];
+                let mut sum = times(&self.diagonal[v], p[v]);
                 for (m, &u) in self.edges[range.clone()].iter().zip(&level.ring[range]) {
-                    sum += *m * p[u as usize];
+                    sum += times(m, p[u as usize]);
                 }
                 *y = sum;
                 curvature += p[v].dot(sum);
@@ -204,8 +206,8 @@ impl System {
     fn solve(&self, level: &Level, products: usize, settings: &Settings<'_>) -> Result<(Vec<DVec2>, usize), Canceled> {
         let n = level.len();
         let mut x = vec![DVec2::ZERO; n];
-        let mut r: Vec<DVec2> = self.nodes.iter().map(|k| -k.gradient).collect();
-        let mut z: Vec<DVec2> = r.iter().zip(&self.nodes).map(|(r, k)| k.inverse * *r).collect();
+        let mut r: Vec<DVec2> = self.gradients.iter().map(|g| -*g).collect();
+        let mut z: Vec<DVec2> = r.iter().zip(&self.inverses).map(|(r, m)| *m * *r).collect();
         let mut p = z.clone();
         let mut q = vec![DVec2::ZERO; n];
         let mut rz: f64 = (0..n).map(|v| r[v].dot(z[v])).sum();
@@ -224,7 +226,7 @@ impl System {
             for v in 0..n {
                 x[v] += alpha * p[v];
                 r[v] -= alpha * q[v];
-                z[v] = self.nodes[v].inverse * r[v];
+                z[v] = self.inverses[v] * r[v];
                 next += r[v].dot(z[v]);
             }
             if next <= FORCING * FORCING * start {
@@ -240,18 +242,33 @@ impl System {
     }
 }
 
+/// One vertex's share of a [`System`].
+struct Node {
+    gradient: DVec2,
+    inverse: DMat2,
+    diagonal: Mat2,
+}
+
+/// A rounded block times a vector.
+fn times(m: &Mat2, v: DVec2) -> DVec2 {
+    let [a, b, c, d] = m.to_cols_array().map(f64::from);
+    DVec2::new(a * v.x + c * v.y, b * v.x + d * v.y)
+}
+
 /// u v^T.
 fn outer(u: DVec2, v: DVec2) -> DMat2 {
     DMat2::from_cols(u * v.x, u * v.y)
 }
 
-/// One triangle's exact gradient, and its Hessian made positive as a sum of squares, in its corners' tangent coordinates.
+/// One triangle's exact gradient, and its Hessian made positive, in its corners' tangent coordinates.
 struct Triangle {
     gradient: [DVec2; 3],
     /// Minus the gradient's part along the corner's direction.
     inward: [f64; 3],
-    /// The Hessian is the sum over modes of m m^T.
-    modes: [[DVec2; 3]; 4],
+    /// The Hessian's blocks of every corner with itself,
+    own: [DMat2; 3],
+    /// and with the next one.
+    next: [DMat2; 3],
 }
 
 impl Triangle {
@@ -293,14 +310,31 @@ impl Triangle {
         let u2 = across.normalize_or(frame[0][1]);
         let (b, c) = (DVec2::new(ab.length(), 0.0), DVec2::new(ac.dot(u1), across.length()));
         let jacobian = outer(b, hat_b) + outer(c, hat_c);
-        let modes = positive_modes(jacobian, area, objective).map(|mode| {
-            [0, 1, 2].map(|i| {
-                let m = mode * hats[i];
-                let m = m.x * u1 + m.y * u2;
-                DVec2::new(frame[i][0].dot(m), frame[i][1].dot(m))
-            })
+        // hat functions' gradients in the corners' tangent planes: a mode m of the Jacobian moves corner i by planes[i] m hats[i]
+        let planes = [0, 1, 2].map(|i| {
+            DMat2::from_cols(
+                DVec2::new(frame[i][0].dot(u1), frame[i][1].dot(u1)),
+                DVec2::new(frame[i][0].dot(u2), frame[i][1].dot(u2)),
+            )
         });
-        Self { gradient, inward, modes }
+        let (mut own, mut next) = ([DMat2::ZERO; 3], [DMat2::ZERO; 3]);
+        for mode in positive_modes(jacobian, area, objective) {
+            let moves = [0, 1, 2].map(|i| planes[i] * (mode * hats[i]));
+            for i in 0..3 {
+                own[i] += outer(moves[i], moves[i]);
+                next[i] += outer(moves[i], moves[(i + 1) % 3]);
+            }
+        }
+        Self { gradient, inward, own, next }
+    }
+
+    /// The block of a corner with the next one.
+    fn after(&self, corner: usize) -> DMat2 {
+        self.next[corner]
+    }
+    /// The block of a corner with the one before.
+    fn before(&self, corner: usize) -> DMat2 {
+        self.next[(corner + 2) % 3].transpose()
     }
 }
 
@@ -331,13 +365,7 @@ fn positive_modes(jacobian: DMat2, area: f64, objective: &Objective) -> [DMat2; 
     // in the basis of s1 + s2 and s1 - s2
     let (plus, minus, mixed) = (0.5 * (by_11 + by_22) + by_12, 0.5 * (by_11 + by_22) - by_12, 0.5 * (by_11 - by_22));
     let (mean, radius) = (0.5 * (plus + minus), (0.25 * (plus - minus) * (plus - minus) + mixed * mixed).sqrt());
-    let axis = if mixed.abs() > 1e-300 {
-        DVec2::new(mean + radius - minus, mixed).normalize_or(DVec2::X)
-    } else if plus >= minus {
-        DVec2::X
-    } else {
-        DVec2::Y
-    };
+    let axis = larger_axis(plus, mixed, minus, mean + radius);
     let scaling = |v: DVec2| v.x * conformal(e) + v.y * anticonformal(f);
     let floor = FLAT * k.by_t;
     let square = |value: f64| (area * value.max(floor)).sqrt();
@@ -347,23 +375,4 @@ fn positive_modes(jacobian: DMat2, area: f64, objective: &Objective) -> [DMat2; 
         square(mean + radius) * scaling(axis),
         square(mean - radius) * scaling(axis.perp()),
     ]
-}
-
-/// The inverse of a symmetric block with its eigenvalues made positive and none much smaller than the other.
-fn inverse_positive(m: DMat2) -> DMat2 {
-    const FLOOR: f64 = 1e-3;
-    let (a, b, c) = (m.x_axis.x, m.x_axis.y, m.y_axis.y);
-    let (mean, radius) = (0.5 * (a + c), (0.25 * (a - c) * (a - c) + b * b).sqrt());
-    let (large, small) = (mean + radius, mean - radius);
-    let floor = FLOOR * large.abs().max(small.abs()) + 1e-300;
-    let axis = if b.abs() > 1e-300 {
-        DVec2::new(large - c, b).normalize_or(DVec2::X)
-    } else if a >= c {
-        DVec2::X
-    } else {
-        DVec2::Y
-    };
-    let across = axis.perp();
-    let (l, s) = (1.0 / large.abs().max(floor), 1.0 / small.abs().max(floor));
-    DMat2::from_cols(l * axis * axis.x + s * across * across.x, l * axis * axis.y + s * across * across.y)
 }
