@@ -204,7 +204,7 @@ fn rank(report: &Report) -> (bool, u64, OrderedDistance) {
     let whole = report.closed && report.euler == 2 && report.charts == 1;
     let flips = report.flips;
     let faults = flips.surface + flips.sphere + flips.uv + report.self_intersections;
-    (!whole, faults, OrderedDistance(report.distance.max))
+    (!whole, faults, OrderedDistance(report.closeness.distance.max))
 }
 
 /// A distance by its total order.

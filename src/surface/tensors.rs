@@ -18,7 +18,7 @@ use super::Surface;
 use super::forms::forms;
 use crate::shrink::lattice::LatticeSpec;
 use safetensors::tensor::{Dtype, TensorView};
-use serde_json::json;
+use serde_json::{Value, json};
 use std::collections::HashMap;
 
 /// Version of the layout above.
@@ -41,7 +41,7 @@ pub fn to_safetensors(surface: &Surface) -> Vec<u8> {
         .flat_map(f32::to_le_bytes)
         .collect();
     let whole = |values: &mut dyn Iterator<Item = u32>| -> Vec<u8> { values.flat_map(u32::to_le_bytes).collect() };
-    let tensors: Vec<(&str, Dtype, Vec<usize>, Vec<u8>)> = vec![
+    let tensors: Vec<Tensor> = vec![
         ("positions", Dtype::F32, vec![rows, columns, 3], on_grid(&surface.positions)),
         ("normals", Dtype::F32, vec![rows, columns, 3], on_grid(&surface.normals)),
         ("uv", Dtype::F32, vec![rows, columns, 2], uv),
@@ -69,6 +69,17 @@ pub fn to_safetensors(surface: &Surface) -> Vec<u8> {
             LatticeSpec::Octahedral { .. } => ["u", "v"],
         },
     });
+    file(&tensors, &about)
+}
+
+/// A tensor before it is written: name, type, shape, and its bytes, little-endian.
+pub(super) type Tensor = (&'static str, Dtype, Vec<usize>, Vec<u8>);
+
+/// Tensors and the metadata's one entry as a safetensors file.
+///
+/// # Panics
+/// When a tensor has not as many bytes as its shape says.
+pub(super) fn file(tensors: &[Tensor], about: &Value) -> Vec<u8> {
     // one entry: the order of several would change from run to run
     let metadata = HashMap::from([("shrinkd".to_owned(), about.to_string())]);
     let views = tensors.iter().map(|(name, dtype, shape, data)| {
