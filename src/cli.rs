@@ -100,6 +100,9 @@ pub struct ExtractArgs {
     /// What the sphere map keeps best
     #[arg(long, value_enum, default_value_t = DistortionArg::Isometric)]
     pub distortion: DistortionArg,
+    /// Relax the UVs further inside the chart, by what --distortion keeps; the sphere's coordinates become TEXCOORD_1
+    #[arg(long)]
+    pub relax_uv: bool,
     /// What to do with a shape that has handles or several components
     #[arg(long, value_enum, default_value_t = OnTopologyArg::Refuse)]
     pub on_topology: OnTopologyArg,

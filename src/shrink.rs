@@ -6,6 +6,7 @@
 
 mod adaptive;
 mod base;
+pub mod chart;
 mod collide;
 mod contract;
 mod creases;
@@ -57,6 +58,10 @@ pub struct ShrinkSpec {
     pub density: Density,
     /// What the sphere map keeps best.
     pub distortion: Distortion,
+    /// Whether the UVs are relaxed further inside the chart, by what `distortion` keeps. The sphere's coordinates are then
+    /// written beside them.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub relax_uv: bool,
     /// What to do with a shape that is no sphere.
     pub on_topology: OnTopology,
     /// Which component to wrap where there are several; without it several are refused.

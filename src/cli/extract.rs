@@ -53,6 +53,7 @@ fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
         lattice: args.lattice,
         density: args.density.into(),
         distortion: args.distortion.into(),
+        relax_uv: args.relax_uv,
         on_topology: args.on_topology.into(),
         component: args.component,
         samples: args.samples,

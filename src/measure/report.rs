@@ -1,9 +1,9 @@
 //! The report: every figure of a result, measured. Definitions are in `docs/metrics.md`.
 
-use super::certificate::certify;
+use super::certificate::{certify, uv_flips};
 use super::distance::{Comparison, to_truth};
 use super::distortion::distortions;
-use super::verdict::{Verdict, judge};
+use super::verdict::{Figures, Verdict, judge};
 use crate::field::sampler::Tally;
 use crate::field::{Counts, Sampler};
 use crate::settings::Canceled;
@@ -106,6 +106,21 @@ pub fn measure(
         verdict: judge(&certificate, &comparison, vertices),
         version: env!("CARGO_PKG_VERSION").to_owned(),
     })
+}
+
+impl Report {
+    /// Measures the chart anew, after it was relaxed: its flips, its distortion, and the verdict on both.
+    pub fn measure_chart(&mut self, surface: &Surface) {
+        self.flips.uv = uv_flips(surface);
+        self.distortion = distortions(surface);
+        let code = "chart_turned";
+        self.verdict.faults.retain(|fault| fault.code != code);
+        self.verdict.passed = self.verdict.faults.is_empty();
+        let figures = Figures { flips: Flips { uv: self.flips.uv, ..Flips::default() }, ..Figures::SOUND };
+        for (code, detail) in figures.misses() {
+            self.verdict.fail(code, detail, &[]);
+        }
+    }
 }
 
 /// Whether a result succeeds by the whole bar, also where its lattice is too coarse to be held to it: closed, Euler 2, one
@@ -229,6 +244,9 @@ pub struct Distortions {
     pub sphere: Distortion,
     /// From the UV square.
     pub uv: Distortion,
+    /// From the UV square before `relax_uv`: where the vertices' places on the sphere are. Only where it was asked for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub uv_before: Option<Distortion>,
 }
 
 /// Distortion of one map, areas matched globally; s1 >= s2 are the singular values per triangle.

@@ -79,6 +79,15 @@ pub struct Figures {
 }
 
 impl Figures {
+    /// Those of a surface with nothing wrong.
+    pub const SOUND: Self = Self {
+        topology: Topology { closed: true, euler: 2, components: 1 },
+        charts: 1,
+        flips: Flips { surface: 0, sphere: 0, uv: 0 },
+        self_intersections: 0,
+        max_distance: 0.0,
+    };
+
     /// The conditions of success that do not hold, by code and sentence: closed, Euler 2, one chart, no flip of any kind, no
     /// self-intersection, and nowhere farther than [`MAX_DISTANCE`] of the diagonal from the truth, both ways.
     pub fn misses(&self) -> Vec<(&'static str, String)> {

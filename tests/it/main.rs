@@ -12,4 +12,5 @@ mod faults;
 mod losses;
 mod metrics;
 mod refusals;
+mod relaxed;
 mod walk;

@@ -307,7 +307,7 @@ impl Triangle {
 /// The Hessian of the energy as a function of a planar Jacobian, times `area`, its negative eigenvalues left out: four
 /// matrices whose squares sum to it (Smith, de Goes and Kim 2019, "Analytic eigensystems for isotropic distortion
 /// energies", in the plane).
-fn positive_modes(jacobian: DMat2, area: f64, objective: &Objective) -> [DMat2; 4] {
+pub fn positive_modes(jacobian: DMat2, area: f64, objective: &Objective) -> [DMat2; 4] {
     /// No direction is taken for flatter than this share of the Dirichlet term's own curvature.
     const FLAT: f64 = 0.02;
     let [[a, c], [b, d]] = jacobian.to_cols_array_2d();
@@ -350,7 +350,7 @@ fn positive_modes(jacobian: DMat2, area: f64, objective: &Objective) -> [DMat2; 
 }
 
 /// The inverse of a symmetric block with its eigenvalues made positive and none much smaller than the other.
-fn inverse_positive(m: DMat2) -> DMat2 {
+pub fn inverse_positive(m: DMat2) -> DMat2 {
     const FLOOR: f64 = 1e-3;
     let (a, b, c) = (m.x_axis.x, m.x_axis.y, m.y_axis.y);
     let (mean, radius) = (0.5 * (a + c), (0.25 * (a - c) * (a - c) + b * b).sqrt());
