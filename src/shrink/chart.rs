@@ -7,9 +7,9 @@
 //! lower the distortion further, at the price of the square: its parts may meet, and must be kept apart one by one.
 //!
 //! The poles of a lat-long chart are teeth, one per sector, with gaps between them. The gaps are filled with triangles that
-//! stand for no surface ([`FILLING`]), so that the argument holds there, too.
+//! stand for no surface, so that the argument holds there, too.
 //!
-//! The energy is the [`Objective`] of the sphere map, infinite where a triangle would turn over, brought to its minimum by
+//! The energy is the objective of the sphere map, infinite where a triangle would turn over, brought to its minimum by
 //! Newton steps of the whole chart (`system`). Every step ends at coordinates in single precision, as they are written: what
 //! is positive here is positive in the file.
 
