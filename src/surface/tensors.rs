@@ -16,7 +16,7 @@
 //! | tensor | shape | type |
 //! |---|---|---|
 //! | `chart_uv` | [m, 2] | f32, relaxed, v downwards |
-//! | `chart_vertex` | [m] | u32, the welded vertex of each |
+//! | `chart_vertex` | \[m\] | u32, the welded vertex of each |
 //! | `chart_triangles` | [n, 3] | u32, chart vertices, in the order of `triangles` |
 //!
 //! The metadata has one entry, `shrinkd`: JSON with `format`, `version`, `lattice`, `rows`, `columns`, `vertices` and
