@@ -12,13 +12,13 @@ mod interrupt;
 pub mod serve;
 
 use crate::field::Domain;
-use crate::field::input::{DomainName, DomainOption};
+use crate::field::input::{DomainName, DomainOption, FieldOptions};
 use crate::measure::chart::SphereChart;
 use crate::shrink::lattice::LatticeSpec;
 use crate::shrink::{Component, Density, Distortion, Method, OnTopology};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 /// Something failed that is neither usage nor input.
@@ -100,6 +100,9 @@ pub struct ExtractArgs {
     /// What the sphere map keeps best
     #[arg(long, value_enum, default_value_t = DistortionArg::Isometric)]
     pub distortion: DistortionArg,
+    /// Relax the UVs further inside the chart, by what --distortion keeps; the sphere's coordinates become TEXCOORD_1
+    #[arg(long)]
+    pub relax_uv: bool,
     /// What to do with a shape that has handles or several components
     #[arg(long, value_enum, default_value_t = OnTopologyArg::Refuse)]
     pub on_topology: OnTopologyArg,
@@ -112,15 +115,9 @@ pub struct ExtractArgs {
     /// Field evaluations that a further attempt may not go beyond
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub max_evaluations: Option<u64>,
-    /// Latent code of an auto-decoder: a JSON list of numbers
-    #[arg(long, value_name = "FILE.json", conflicts_with = "latent_row")]
-    pub latent: Option<PathBuf>,
-    /// Row of the input's own table of latent codes
-    #[arg(long, value_name = "N")]
-    pub latent_row: Option<u32>,
-    /// Box that holds the zero level set (of a grid: that its samples span): fit, or X0,Y0,Z0,X1,Y1,Z1
-    #[arg(long, value_name = "BOX", value_parser = parse_domain, allow_hyphen_values = true)]
-    pub domain: Option<DomainOption>,
+    /// What the field leaves open.
+    #[command(flatten)]
+    pub field_options: FieldArgs,
     /// Where the report goes (JSON)
     #[arg(long, value_name = "R.json")]
     pub report: Option<PathBuf>,
@@ -136,6 +133,43 @@ pub struct ExtractArgs {
     /// Threads; 0 is one per core. The result does not depend on it
     #[arg(long, default_value_t = 0)]
     pub threads: usize,
+}
+
+/// What a file with a field in it leaves open.
+#[derive(Debug, Args)]
+pub struct FieldArgs {
+    /// Latent code of an auto-decoder: a JSON list of numbers
+    #[arg(long, value_name = "FILE.json", conflicts_with = "latent_row")]
+    pub latent: Option<PathBuf>,
+    /// Row of the field's own table of latent codes
+    #[arg(long, value_name = "N")]
+    pub latent_row: Option<u32>,
+    /// Box that holds the field's zero level set (of a grid: that its samples span): fit, or X0,Y0,Z0,X1,Y1,Z1
+    #[arg(long, value_name = "BOX", value_parser = parse_domain, allow_hyphen_values = true)]
+    pub domain: Option<DomainOption>,
+}
+
+impl FieldArgs {
+    /// What they say of a field, the latent code read from its file.
+    ///
+    /// # Errors
+    /// An exit code and what to say, when that file is no list of finite numbers.
+    fn read(&self) -> Result<FieldOptions, (u8, String)> {
+        Ok(FieldOptions {
+            latent: self.latent.as_deref().map(read_latent).transpose()?,
+            latent_row: self.latent_row,
+            domain: self.domain,
+            ..FieldOptions::default()
+        })
+    }
+}
+
+/// A latent code from a file: a JSON list of finite numbers.
+fn read_latent(path: &Path) -> Result<Vec<f32>, (u8, String)> {
+    let wrong = |e: &dyn std::fmt::Display| (BAD_INPUT, format!("{}: {e}", path.display()));
+    let text = std::fs::read(path).map_err(|e| wrong(&e))?;
+    let latent: Vec<f32> = serde_json::from_slice(&text).map_err(|e| wrong(&e))?;
+    if latent.iter().all(|z| z.is_finite()) { Ok(latent) } else { Err(wrong(&"a number is not finite")) }
 }
 
 /// What `evaluate --help` ends with.
@@ -169,15 +203,9 @@ pub struct EvaluateArgs {
     /// Leave out marching cubes
     #[arg(long)]
     pub no_baseline: bool,
-    /// Latent code of an auto-decoder that is the truth: a JSON list of numbers
-    #[arg(long, value_name = "FILE.json", conflicts_with = "latent_row")]
-    pub latent: Option<PathBuf>,
-    /// Row of the truth's own table of latent codes
-    #[arg(long, value_name = "N")]
-    pub latent_row: Option<u32>,
-    /// Box that holds the truth's zero level set (of a grid: that its samples span): fit, or X0,Y0,Z0,X1,Y1,Z1
-    #[arg(long, value_name = "BOX", value_parser = parse_domain, allow_hyphen_values = true)]
-    pub domain: Option<DomainOption>,
+    /// What the truth leaves open.
+    #[command(flatten)]
+    pub truth_options: FieldArgs,
     /// Threads; 0 is one per core. The result does not depend on it
     #[arg(long, default_value_t = 0)]
     pub threads: usize,

@@ -2,7 +2,7 @@
 //! pass, telling the next attempt where the last ones went wrong.
 //!
 //! Guarantees: the first attempt that passes is the result; when none does, the best one is, with a verdict that says what is
-//! wrong and where. Every evaluation of every attempt is counted into the sampler's tally; those of measuring are not. Like
+//! wrong and where. Only its chart is relaxed, where that is asked for. Every evaluation of every attempt is counted into the sampler's tally; those of measuring are not. Like
 //! the rooms it stands on, it knows no clock: a caller who has one is told when a [`Part`] begins.
 
 use crate::field::sampler::Tally;
@@ -67,6 +67,8 @@ pub struct Extracted {
 
 /// Where the share of every attempt in the progress ends. The first one mostly is the last.
 const ENDS: [f32; 1 + Effort::ATTEMPTS as usize] = [0.0, 0.85, 0.93, 1.0];
+/// Where relaxing the chart of the surface that was chosen starts.
+const RELAXING: f32 = 0.95;
 /// Repairs of one attempt's surface, each followed by a measurement.
 const REPAIRS: u32 = 2;
 /// Share of an attempt's time that shrinking takes; measuring takes the rest.
@@ -164,7 +166,14 @@ pub fn extract(
             break;
         }
     }
-    let Some((surface, mut report)) = best else { return Err(nothing) };
+    let Some((mut surface, mut report)) = best else { return Err(nothing) };
+    if spec.relax_uv {
+        begins(Part::Shrink);
+        let progress = |progress: Progress| told.tell(made - 1, RELAXING, 1.0, progress);
+        surface.relax_uv(spec.distortion, &Settings { progress: &progress, ..told.settings })?;
+        begins(Part::Measure);
+        report.measure_chart(&surface);
+    }
     report.attempts = made;
     report.evaluations = Evaluations::new(&sampler.tally().by_stage(), report.vertices);
     if let Some(error) = &refusal {
@@ -204,7 +213,7 @@ fn rank(report: &Report) -> (bool, u64, OrderedDistance) {
     let whole = report.closed && report.euler == 2 && report.charts == 1;
     let flips = report.flips;
     let faults = flips.surface + flips.sphere + flips.uv + report.self_intersections;
-    (!whole, faults, OrderedDistance(report.distance.max))
+    (!whole, faults, OrderedDistance(report.closeness.distance.max))
 }
 
 /// A distance by its total order.

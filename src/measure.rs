@@ -19,6 +19,7 @@ pub mod nearest;
 pub mod predicates;
 pub mod report;
 pub mod sampling;
+mod tallied;
 pub mod truth;
 pub mod verdict;
 pub mod zero_set;

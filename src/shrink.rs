@@ -6,6 +6,7 @@
 
 mod adaptive;
 mod base;
+pub mod chart;
 mod collide;
 mod complex;
 mod contract;
@@ -58,6 +59,10 @@ pub struct ShrinkSpec {
     pub density: Density,
     /// What the sphere map keeps best.
     pub distortion: Distortion,
+    /// Whether the UVs are relaxed further inside the chart, by what `distortion` keeps. The sphere's coordinates are then
+    /// written beside them.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub relax_uv: bool,
     /// What to do with a shape that is no sphere.
     pub on_topology: OnTopology,
     /// Which component to wrap where there are several; without it several are refused.
@@ -227,11 +232,19 @@ pub enum ShrinkError {
         places: Vec<[f64; 3]>,
     },
     /// The zero level set has handles.
-    #[error("the zero level set has genus {genus} (handles; in the plane, holes), and only genus 0 can be wrapped")]
+    #[error("the zero level set has genus {genus} (so many handles), and only genus 0 can be wrapped")]
     Genus {
         /// Number of handles.
         genus: usize,
         /// Scene positions on the handles that were found; at most 16.
+        places: Vec<[f64; 3]>,
+    },
+    /// The zero level set of a field of dimension 2 has holes: the plane's kind of handles.
+    #[error("the solid in the plane has {count} {}, and only one without holes is followed", if *.count == 1 { "hole" } else { "holes" })]
+    Holes {
+        /// Number of holes.
+        count: usize,
+        /// Scene positions, one inside each; at most 16.
         places: Vec<[f64; 3]>,
     },
     /// The base surface could not be mapped to the sphere.
@@ -255,7 +268,7 @@ impl ShrinkError {
             ShrinkError::Empty { .. } => "empty_zero_set",
             ShrinkError::Components { .. } => "components",
             ShrinkError::NoComponent { .. } => "no_such_component",
-            ShrinkError::Genus { .. } => "genus",
+            ShrinkError::Genus { .. } | ShrinkError::Holes { .. } => "genus",
             ShrinkError::Unmapped => "unmapped",
             ShrinkError::Dimension { .. } => "dimension",
         }
@@ -265,7 +278,8 @@ impl ShrinkError {
         match self {
             ShrinkError::Components { places, .. }
             | ShrinkError::NoComponent { places, .. }
-            | ShrinkError::Genus { places, .. } => places.iter().map(|&p| DVec3::from(p)).collect(),
+            | ShrinkError::Genus { places, .. }
+            | ShrinkError::Holes { places, .. } => places.iter().map(|&p| DVec3::from(p)).collect(),
             _ => Vec::new(),
         }
     }

@@ -10,9 +10,11 @@ pub mod raster;
 pub mod sheet;
 pub mod tensors;
 
-use crate::shrink::Wrap;
+use crate::settings::{Canceled, Settings};
+use crate::shrink::chart::relax;
 use crate::shrink::lattice::SphereLattice;
-use glam::DVec3;
+use crate::shrink::{Distortion, Wrap};
+use glam::{DVec3, Vec3};
 
 /// A parameterized surface: one chart over a sphere lattice, in scene units and single precision, as it is written.
 #[derive(Clone, Debug)]
@@ -31,6 +33,9 @@ pub struct Surface {
     pub triangles: Vec<[u32; 3]>,
     /// The same triangles over chart vertices (`lattice.chart`, `lattice.uv`), in the same order.
     pub chart_triangles: Vec<[u32; 3]>,
+    /// UV of every chart vertex where the chart was relaxed (see [`crate::shrink::chart`]); otherwise it is `lattice.uv`, the
+    /// place on the sphere.
+    pub relaxed_uv: Option<Vec<[f64; 2]>>,
 }
 
 impl Surface {
@@ -45,6 +50,22 @@ impl Surface {
             triangles: wrap.lattice.triangles(&wrap.diagonals),
             chart_triangles: wrap.lattice.chart_triangles(&wrap.diagonals),
             lattice: wrap.lattice,
+            relaxed_uv: None,
         }
+    }
+
+    /// UV of every chart vertex.
+    pub fn uv(&self) -> &[[f64; 2]] {
+        self.relaxed_uv.as_ref().unwrap_or(&self.lattice.uv)
+    }
+
+    /// Relaxes the chart by what `distortion` keeps.
+    ///
+    /// # Errors
+    /// When the token is raised.
+    pub fn relax_uv(&mut self, distortion: Distortion, settings: &Settings<'_>) -> Result<(), Canceled> {
+        let positions: Vec<DVec3> = self.positions.iter().map(|&p| Vec3::from(p).as_dvec3()).collect();
+        self.relaxed_uv = Some(relax(&self.lattice, &self.chart_triangles, &positions, distortion, settings)?);
+        Ok(())
     }
 }

@@ -2,9 +2,9 @@
 
 mod table;
 
-use super::{BAD_INPUT, EvaluateArgs, FAILED, extract, fail, interrupt};
+use super::{BAD_INPUT, EvaluateArgs, FAILED, fail, interrupt};
 use crate::field::Sampler;
-use crate::field::input::{self, Description, FieldOptions};
+use crate::field::input::{self, Description};
 use crate::field::mesh::{ChartedMesh, MeshFormat, TriangleMesh};
 use crate::field::sampler::Tally;
 use crate::measure::chart::SphereChart;
@@ -35,14 +35,8 @@ fn measured(args: &EvaluateArgs) -> Result<Result<(), Vec<String>>, (u8, String)
         return Err(wrong(&args.mesh, &"--chart was given, and the file has no texture coordinates"));
     }
     let bytes = std::fs::read(&args.truth).map_err(|e| wrong(&args.truth, &e))?;
-    let options = FieldOptions {
-        latent: extract::read_latent(args.latent.as_deref())?,
-        latent_row: args.latent_row,
-        domain: args.domain,
-        ..FieldOptions::default()
-    };
     let kind = input::describe(&bytes).map_err(|e| wrong(&args.truth, &e))?;
-    let field = input::open(&bytes, &options).map_err(|e| wrong(&args.truth, &e))?;
+    let field = input::open(&bytes, &args.truth_options.read()?).map_err(|e| wrong(&args.truth, &e))?;
     if field.dimension() != 3 {
         return Err(wrong(&args.truth, &"a curve, and a surface is needed"));
     }

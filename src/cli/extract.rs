@@ -2,9 +2,8 @@
 
 use super::{BAD_INPUT, BAD_USAGE, ExtractArgs, FAILED, NOT_WRAPPED, fail};
 use crate::extract::Budget;
-use crate::field::input::FieldOptions;
 use crate::job::failure::Ended;
-use crate::job::pipeline::{self, CurveMade, Made};
+use crate::job::pipeline::{self, Asked, CurveMade, Made};
 use crate::job::spec::{FieldSpec, OutputName};
 use crate::measure::verdict::Finding;
 use crate::settings::{CancelToken, Progress, Settings};
@@ -32,13 +31,7 @@ pub fn run(args: &ExtractArgs) -> ExitCode {
 fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
     let clock = Instant::now();
     let bytes = std::fs::read(&args.field).map_err(|e| (BAD_INPUT, format!("{}: {e}", args.field.display())))?;
-    let options = FieldOptions {
-        latent: read_latent(args.latent.as_deref())?,
-        latent_row: args.latent_row,
-        domain: args.domain,
-        ..FieldOptions::default()
-    };
-    let spec = FieldSpec { options, ..FieldSpec::default() };
+    let spec = FieldSpec { options: args.field_options.read()?, ..FieldSpec::default() };
     let in_field = |detail: &str| format!("{}: {detail}", args.field.display());
     let opened = pipeline::open(&spec, Some(&bytes), "").map_err(|failure| {
         let places: String = failure.errors.iter().map(|e| format!("\n  {}: {}", e.pointer, e.detail)).collect();
@@ -60,12 +53,14 @@ fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
         lattice: args.lattice,
         density: args.density.into(),
         distortion: args.distortion.into(),
+        relax_uv: args.relax_uv,
         on_topology: args.on_topology.into(),
         component: args.component,
         samples: args.samples,
     };
     let budget = Budget { attempts: args.attempts, evaluations: args.max_evaluations };
-    let load = clock.elapsed().as_secs_f64();
+    let load_seconds = clock.elapsed().as_secs_f64();
+    let asked = |outputs| Asked { shrink: &shrink, budget, outputs, load_seconds };
     let ended = |ended: Ended| match ended {
         Ended::Failed(failure) if failure.is_bad_input() => (BAD_INPUT, in_field(&failure.detail)),
         Ended::Failed(failure) => (NOT_WRAPPED, in_field(&format!("{} ({})", failure.detail, failure.code))),
@@ -77,7 +72,7 @@ fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
         files.push((OutputName::Svg, svg.clone()));
         files.sort();
         let outputs: Vec<OutputName> = files.iter().map(|(output, _)| *output).collect();
-        let made = pipeline::make_curve(&opened, &shrink, budget, &outputs, load, settings).map_err(ended)?;
+        let made = pipeline::make_curve(&opened, &asked(&outputs), settings).map_err(ended)?;
         bar.finish_and_clear();
         for ((_, path), (_, bytes)) in files.iter().zip(&made.files) {
             write(path, bytes)?;
@@ -98,7 +93,7 @@ fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
     }
     let files = wanted(args);
     let outputs: Vec<OutputName> = files.iter().map(|(output, _)| *output).collect();
-    let made = pipeline::make(&opened, &shrink, budget, &outputs, load, settings).map_err(ended)?;
+    let made = pipeline::make(&opened, &asked(&outputs), settings).map_err(ended)?;
     bar.finish_and_clear();
     for ((_, path), (_, bytes)) in files.iter().zip(&made.files) {
         write(path, bytes)?;
@@ -140,15 +135,6 @@ fn wanted(args: &ExtractArgs) -> Vec<(OutputName, PathBuf)> {
     files.into_iter().filter_map(|(output, path)| Some((output, path?.clone()))).collect()
 }
 
-/// A latent code from a file: a JSON list of finite numbers.
-pub(super) fn read_latent(path: Option<&Path>) -> Result<Option<Vec<f32>>, (u8, String)> {
-    let Some(path) = path else { return Ok(None) };
-    let wrong = |e: &dyn std::fmt::Display| (BAD_INPUT, format!("{}: {e}", path.display()));
-    let text = std::fs::read(path).map_err(|e| wrong(&e))?;
-    let latent: Vec<f32> = serde_json::from_slice(&text).map_err(|e| wrong(&e))?;
-    if latent.iter().all(|z| z.is_finite()) { Ok(Some(latent)) } else { Err(wrong(&"a number is not finite")) }
-}
-
 fn write(path: &Path, bytes: &[u8]) -> Result<(), (u8, String)> {
     std::fs::write(path, bytes).map_err(|e| (FAILED, format!("{}: {e}", path.display())))
 }
@@ -175,8 +161,8 @@ fn summary(args: &ExtractArgs, made: &Made, seconds: f64) -> String {
         name(&args.output),
         report.vertices,
         report.evaluations.per_vertex,
-        report.normal_consistency,
-        100.0 * report.distance.max,
+        report.closeness.normal_consistency,
+        100.0 * report.closeness.distance.max,
     )
 }
 
@@ -190,6 +176,6 @@ fn curve_summary(args: &ExtractArgs, svg: &Path, made: &CurveMade, seconds: f64)
         report.vertices,
         report.evaluations.per_vertex,
         report.self_intersections,
-        100.0 * report.distance.max,
+        100.0 * report.closeness.distance.max,
     )
 }

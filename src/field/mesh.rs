@@ -52,6 +52,8 @@ pub struct ChartedMesh {
     pub vertices: Vec<[f64; 3]>,
     /// Texture coordinates of every vertex, v downwards.
     pub uv: Vec<[f32; 2]>,
+    /// The second ones, where they are there.
+    pub second_uv: Option<Vec<[f32; 2]>>,
     /// Triangles, indices into both.
     pub triangles: Vec<[u32; 3]>,
     /// The `extras` of the document; null when there are none.
@@ -59,8 +61,8 @@ pub struct ChartedMesh {
 }
 
 impl ChartedMesh {
-    /// Reads the mesh of a GLB with its first texture coordinates. `None` when the bytes are of another format, when a
-    /// primitive has no texture coordinates, or one of them is not finite.
+    /// Reads the mesh of a GLB with its texture coordinates. `None` when the bytes are of another format, when a
+    /// primitive has no first texture coordinates, or one of them is not finite.
     ///
     /// # Errors
     /// As [`TriangleMesh::read`].
@@ -69,8 +71,9 @@ impl ChartedMesh {
             return Ok(None);
         }
         let (soup, extras) = glb::read_charted(bytes)?;
-        let uv = soup.places.filter(|places| places.iter().flatten().all(|c| c.is_finite()));
-        Ok(uv.map(|uv| Self { vertices: soup.vertices, uv, triangles: soup.triangles, extras }))
+        let finite = |places: &Vec<[f32; 2]>| places.iter().flatten().all(|c| c.is_finite());
+        let [uv, second_uv] = soup.places.map(|places| places.filter(finite));
+        Ok(uv.map(|uv| Self { vertices: soup.vertices, uv, second_uv, triangles: soup.triangles, extras }))
     }
 }
 
@@ -161,8 +164,8 @@ struct Soup {
     format: &'static str,
     vertices: Vec<[f64; 3]>,
     triangles: Vec<[u32; 3]>,
-    /// Texture coordinates by vertex, for a reader that was asked for them.
-    places: Option<Vec<[f32; 2]>>,
+    /// First and second texture coordinates by vertex, for a reader that was asked for them.
+    places: [Option<Vec<[f32; 2]>>; 2],
 }
 
 impl Soup {

@@ -147,6 +147,7 @@ impl Failure {
             ShrinkError::Components { .. } => "the zero level set has several components",
             ShrinkError::NoComponent { .. } => "there is no such component",
             ShrinkError::Genus { .. } => "the zero level set has handles",
+            ShrinkError::Holes { .. } => "the solid in the plane has holes",
             ShrinkError::Unmapped => "the surface could not be mapped to the sphere",
             ShrinkError::Dimension { .. } => "the field has the wrong dimension for this",
         };

@@ -74,21 +74,42 @@ pub struct Finished {
     pub problem: Option<Failure>,
 }
 
+/// What is asked of a field.
+#[derive(Clone, Copy, Debug)]
+pub struct Asked<'a> {
+    /// How it is shrunk.
+    pub shrink: &'a ShrinkSpec,
+    /// What may be spent on it.
+    pub budget: Budget,
+    /// What is made.
+    pub outputs: &'a [OutputName],
+    /// Seconds that opening the field took, for the report.
+    pub load_seconds: f64,
+}
+
+impl Asked<'_> {
+    /// Writes every output by `bytes`, in order, until the token is raised.
+    fn written(
+        &self,
+        settings: &Settings<'_>,
+        mut bytes: impl FnMut(OutputName) -> Result<Vec<u8>, Ended>,
+    ) -> Result<Vec<(OutputName, Vec<u8>)>, Ended> {
+        let write = |&output: &OutputName| {
+            settings.cancel.check()?;
+            Ok((output, bytes(output)?))
+        };
+        self.outputs.iter().map(write).collect()
+    }
+}
+
 /// Makes what a job asks for: a surface of a field of dimension 3, a curve of one of dimension 2.
-pub fn run(
-    opened: &Opened,
-    spec: &ShrinkSpec,
-    budget: Budget,
-    outputs: &[OutputName],
-    load_seconds: f64,
-    settings: Settings<'_>,
-) -> Result<Finished, Ended> {
+pub fn run(opened: &Opened, asked: &Asked<'_>, settings: Settings<'_>) -> Result<Finished, Ended> {
     if opened.field.dimension() == 2 {
-        let made = make_curve(opened, spec, budget, outputs, load_seconds, settings)?;
+        let made = make_curve(opened, asked, settings)?;
         let (certified, problem) = (made.is_sound(), made.problem());
         return Ok(Finished { metrics: json!(made.report), certified, problem, files: made.files });
     }
-    let made = make(opened, spec, budget, outputs, load_seconds, settings)?;
+    let made = make(opened, asked, settings)?;
     let (certified, problem) = (made.is_sound(), made.problem());
     Ok(Finished { metrics: json!(made.report), certified, problem, files: made.files })
 }
@@ -143,27 +164,20 @@ impl Clock {
     }
 }
 
-/// Makes a certified surface of the field, or the best there is, and writes it. `load_seconds` is what opening the field took.
+/// Makes a certified surface of the field, or the best there is, and writes it.
 ///
 /// Every output but the report is the same for the same request, whatever the clock and the number of threads say.
-pub fn make(
-    opened: &Opened,
-    spec: &ShrinkSpec,
-    budget: Budget,
-    outputs: &[OutputName],
-    load_seconds: f64,
-    settings: Settings<'_>,
-) -> Result<Made, Ended> {
+pub fn make(opened: &Opened, asked: &Asked<'_>, settings: Settings<'_>) -> Result<Made, Ended> {
     let told = |progress: Progress| {
         (settings.progress)(Progress { fraction: MEASURED_SHARE * progress.fraction, ..progress });
     };
     let tally = Tally::new();
     let sampler = Sampler::new(opened.field.as_ref(), Settings { progress: &told, ..settings }, &tally);
     let clock = Clock::default();
-    let made = extract(&sampler, spec, budget, &|part| clock.begin(Some(part)));
+    let made = extract(&sampler, asked.shrink, asked.budget, &|part| clock.begin(Some(part)));
     clock.begin(None);
     let Extracted { surface, mut report, refusal } = made?;
-    report.seconds.load = load_seconds;
+    report.seconds.load = asked.load_seconds;
     report.seconds.shrink = clock.shrink.get();
     report.seconds.finish = clock.measure.get();
 
@@ -171,10 +185,8 @@ pub fn make(
     (settings.progress)(Progress { fraction: MEASURED_SHARE, ..write });
     let clock = Instant::now();
     let lasting = lasting(&report);
-    let mut files = Vec::new();
-    for &output in outputs {
-        settings.cancel.check()?;
-        let bytes = match output {
+    let files = asked.written(&settings, |output| {
+        Ok(match output {
             OutputName::Glb => surface::gltf::to_glb(&surface, &lasting, &opened.provenance),
             OutputName::Surface => surface::tensors::to_safetensors(&surface),
             OutputName::Svg => {
@@ -186,9 +198,8 @@ pub fn make(
                 report.seconds.write = clock.elapsed().as_secs_f64();
                 pretty(&report)
             }
-        };
-        files.push((output, bytes));
-    }
+        })
+    })?;
     Ok(Made { report, files, refusal })
 }
 

@@ -210,6 +210,14 @@ impl Faults {
         found
     }
 
+    fn boolean(&mut self, value: &Value, pointer: &str) -> Option<bool> {
+        let found = value.as_bool();
+        if found.is_none() {
+            self.add(pointer, "wrong_type", format!("expected true or false, found {}", type_name(value)));
+        }
+        found
+    }
+
     fn number(&mut self, value: &Value, pointer: &str) -> Option<f32> {
         let Some(number) = value.as_f64() else {
             self.add(pointer, "wrong_type", format!("expected a number, found {}", type_name(value)));
@@ -338,7 +346,7 @@ fn read_latent(value: &Value, faults: &mut Faults) -> Option<Vec<f32>> {
 
 fn read_shrink(value: &Value, faults: &mut Faults) -> ShrinkSpec {
     let mut shrink = ShrinkSpec::default();
-    let known = ["method", "lattice", "density", "distortion", "on_topology", "component", "samples"];
+    let known = ["method", "lattice", "density", "distortion", "relax_uv", "on_topology", "component", "samples"];
     let Some(object) = faults.object(value, "/shrink", &known) else { return shrink };
     use {Density as D, Distortion as K, Method as M, OnTopology as T};
     let methods = [("adaptive", M::Adaptive), ("paper", M::Paper)];
@@ -349,6 +357,9 @@ fn read_shrink(value: &Value, faults: &mut Faults) -> ShrinkSpec {
     choose(object, "density", &densities, &mut shrink.density, faults);
     choose(object, "distortion", &distortions, &mut shrink.distortion, faults);
     choose(object, "on_topology", &topologies, &mut shrink.on_topology, faults);
+    if let Some(relax) = object.get("relax_uv") {
+        shrink.relax_uv = faults.boolean(relax, "/shrink/relax_uv").unwrap_or_default();
+    }
     shrink.component = object.get("component").and_then(|component| read_component(component, faults));
     if let Some(lattice) = object.get("lattice").and_then(|lattice| read_lattice(lattice, faults)) {
         faults.0.extend(check_lattice(lattice, "/shrink/lattice"));
@@ -550,7 +561,7 @@ mod tests {
             "field": {"input": format!("sha256:{}", "ab".repeat(32)), "latent": [0.5, -1.0], "level": 0.25,
                       "domain": {"min": [-1, -1, -1], "max": [1, 1, 2]}},
             "shrink": {"method": "paper", "lattice": {"octahedral": {"n": 9}}, "density": "reach", "distortion": "angle",
-                       "on_topology": "wrap", "component": 2},
+                       "relax_uv": true, "on_topology": "wrap", "component": 2},
             "budget": {"attempts": 2, "evaluations": 5_000_000_000u64},
             "outputs": ["report", "glb"], "labels": {"project": "demo"},
         });
@@ -570,7 +581,8 @@ mod tests {
     fn options_and_budget_are_checked_member_by_member() {
         let found = faults(json!({
             "field": {"scene": {}},
-            "shrink": {"density": "even", "distortion": 3, "on_topology": "ignore", "component": -1, "smooth": true},
+            "shrink": {"density": "even", "distortion": 3, "relax_uv": "yes", "on_topology": "ignore",
+                       "component": -1, "smooth": true},
             "budget": {"attempts": 4, "evaluations": 0, "seconds": 3},
         }));
         let expected = [
@@ -578,6 +590,7 @@ mod tests {
             ("/shrink/density", "unknown_value"),
             ("/shrink/distortion", "wrong_type"),
             ("/shrink/on_topology", "unknown_value"),
+            ("/shrink/relax_uv", "wrong_type"),
             ("/shrink/component", "wrong_type"),
             ("/budget/seconds", "unknown_member"),
             ("/budget/attempts", "out_of_range"),

@@ -5,9 +5,10 @@
 
 use super::failure::{Ended, Failure};
 use super::preview::MeshPreview;
-use super::{EventKind, Output, OutputName, ProgressView, pipeline};
+use super::{EventKind, Output, OutputName, ProgressView};
 use crate::blobs::{BlobError, Blobs};
 use crate::engine::{Claim, Engine, EngineError, Outcome, Renewal, Update};
+use crate::job::pipeline::{self, Asked};
 use crate::settings::{CancelToken, Progress, Settings};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -192,9 +193,14 @@ impl Worker {
                 let teller = Teller::new(news);
                 let progress = |progress: Progress| teller.tell(progress);
                 let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress };
-                let load = clock.elapsed().as_secs_f64();
                 let spec = &claim.spec;
-                pipeline::run(&opened, &spec.shrink, spec.budget, &spec.outputs, load, settings)
+                let asked = Asked {
+                    shrink: &spec.shrink,
+                    budget: spec.budget,
+                    outputs: &spec.outputs,
+                    load_seconds: clock.elapsed().as_secs_f64(),
+                };
+                pipeline::run(&opened, &asked, settings)
             };
             tokio::task::spawn_blocking(compute).await.unwrap_or_else(|panic| {
                 tracing::error!(%panic, "the computation panicked");

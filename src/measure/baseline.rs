@@ -3,7 +3,7 @@
 use super::bvh::Aabb;
 use super::distance::Mesh;
 use super::marching_cubes::{Cubes, marching_cubes};
-use super::report::Distance;
+use super::report::Closeness;
 use super::truth::Truth;
 use crate::settings::Canceled;
 use glam::DVec3;
@@ -27,12 +27,9 @@ pub struct Baseline {
     pub triangles: u64,
     /// Field values that the whole grid takes, `side^3`.
     pub values: u64,
-    /// Distances, in parts of the truth's diagonal.
-    pub distance: Distance,
-    /// Mean of |n . n'| over both directions, face normals.
-    pub normal_consistency: f64,
-    /// Mean of n . n' over both directions, face normals.
-    pub normal_consistency_signed: f64,
+    /// Distances, in parts of the truth's diagonal, and how face normals agree.
+    #[serde(flatten)]
+    pub closeness: Closeness,
 }
 
 /// Edge of the cube about a box, and the cube's smallest corner.
@@ -72,9 +69,7 @@ pub fn baseline(truth: &Truth<'_, '_>, side: usize) -> Result<Option<Baseline>, 
         vertices: cubes.vertices.len() as u64,
         triangles: cubes.triangles.len() as u64,
         values: cubes.values,
-        distance: comparison.distance,
-        normal_consistency: comparison.normal_consistency,
-        normal_consistency_signed: comparison.normal_consistency_signed,
+        closeness: comparison.closeness,
     }))
 }
 
@@ -96,7 +91,10 @@ mod tests {
                 let found = baseline(&truth, side).unwrap().unwrap();
                 let ratio = found.vertices as f64 / wanted as f64;
                 assert!((0.97..1.12).contains(&ratio), "{wanted}: {found:?}");
-                assert!(found.distance.max < 0.01 && found.normal_consistency_signed > 0.99, "{found:?}");
+                assert!(
+                    found.closeness.distance.max < 0.01 && found.closeness.normal_consistency_signed > 0.99,
+                    "{found:?}"
+                );
             }
         });
     }

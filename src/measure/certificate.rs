@@ -140,9 +140,10 @@ fn sphere_flips(surface: &Surface) -> u64 {
 }
 
 /// Chart triangles that are mirrored or have no area. As v points down, counter-clockwise from outside is negative in (u, v).
-fn uv_flips(surface: &Surface) -> u64 {
+pub fn uv_flips(surface: &Surface) -> u64 {
+    let uv = surface.uv();
     let mirrored = |t: &&[u32; 3]| {
-        let [a, b, c] = t.map(|v| surface.lattice.uv[v as usize]);
+        let [a, b, c] = t.map(|v| uv[v as usize]);
         (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) >= 0.0
     };
     surface.chart_triangles.iter().filter(mirrored).count() as u64

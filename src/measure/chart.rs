@@ -96,8 +96,10 @@ pub fn chart_figures(mesh: &ChartedMesh, chart: Option<SphereChart>) -> ChartFig
         let place = t.map(|v| DVec2::new(aspect * places[v as usize].x, -places[v as usize].y));
         (place, at(t))
     });
+    // a chart that was relaxed names no directions any more; the second coordinates do
+    let on_chart = mesh.second_uv.as_ref().filter(|_| relaxed(&mesh.extras)).unwrap_or(&mesh.uv);
     let directions: Option<Vec<DVec3>> =
-        chart.map(|chart| places.iter().map(|p| chart.direction(p.to_array())).collect());
+        chart.map(|chart| on_chart.iter().map(|uv| chart.direction(uv.map(f64::from))).collect());
     let on_sphere = |t: &[u32; 3], directions: &[DVec3]| t.map(|v| directions[v as usize]);
     ChartFigures {
         charts: charts(mesh),
@@ -115,6 +117,11 @@ pub fn chart_figures(mesh: &ChartedMesh, chart: Option<SphereChart>) -> ChartFig
             distortion(mesh.triangles.iter().map(|t| (super::distortion::flatten(on_sphere(t, directions)), at(t))))
         }),
     }
+}
+
+/// Whether a GLB of ours says that its chart was relaxed.
+fn relaxed(extras: &serde_json::Value) -> bool {
+    extras.pointer("/report/options/relax_uv").is_some_and(|relaxed| relaxed == true)
 }
 
 /// Components through vertices of one position and one place in the chart: a vertex may be there twice for its normals.
@@ -182,6 +189,7 @@ mod tests {
             // v downwards: the first triangle is right, the second mirrored
             uv: vec![[0.0, 1.0], [0.4, 1.0], [0.0, 0.6], [0.6, 0.0], [1.0, 0.0], [0.6, 0.4]],
             triangles: vec![[0, 1, 2], [3, 4, 5]],
+            second_uv: None,
             extras: Value::Null,
         };
         let found = chart_figures(&mesh, None);

@@ -5,8 +5,9 @@ mod polygon;
 mod zeros;
 
 use super::nearest::Nearest;
-use super::report::{Distance, Evaluations, Flips, MAX_DISTANCE, OneWay, Seconds};
-use super::verdict::Verdict;
+use super::report::{Closeness, Evaluations, Flips, MAX_DISTANCE, Seconds};
+use super::tallied::Tallied;
+use super::verdict::{Verdict, too_far};
 use super::zero_set::trace;
 use super::{diagonal, map_chunks};
 use crate::field::sampler::Tally;
@@ -56,12 +57,9 @@ pub struct CurveReport {
     pub self_intersections: u64,
     /// Edges of exactly no length.
     pub degenerate: u64,
-    /// Distances between curve and zero set, in parts of the zero set's bounding-box diagonal, both ways.
-    pub distance: Distance,
-    /// Mean of |n . n'| over both directions, edge normals and the field's gradients.
-    pub normal_consistency: f64,
-    /// The same with the sign: n . n'.
-    pub normal_consistency_signed: f64,
+    /// Distances between curve and zero set, and how edge normals agree with the field's gradients.
+    #[serde(flatten)]
+    pub closeness: Closeness,
     /// How the parameter runs along the zero set.
     pub arc_length: ArcLength,
     /// Samples that are corners of the zero set.
@@ -142,27 +140,27 @@ pub fn measure(
     if compared && n > 0 {
         let landed = land(&probes, &zeros, REACH * size, &sampler)?;
         let normals: Vec<DVec3> = (0..n).map(|i| outward(ends(i))).collect();
+        let bar = MAX_DISTANCE * size;
         for (k, (p, end)) in probes.iter().zip(&landed.ends).enumerate() {
             let i = k / pieces;
             let weight = ends(i)[0].distance(ends(i)[1]) / pieces as f64;
-            there.add(weight, p.distance(*end), normals[i].dot(landed.normals[k]), *p);
+            there.add(weight, p.distance(*end), normals[i].dot(landed.normals[k]));
         }
+        there.extremes(bar, probes.iter().zip(&landed.ends).map(|(p, end)| (p.distance(*end), *p)));
         let lifted: Vec<DVec3> = polygon.iter().map(|p| p.extend(0.0)).collect();
         // triangles without area are their edges
         let edges: Vec<[u32; 3]> = (0..n as u32).map(|i| [i, (i + 1) % n as u32, (i + 1) % n as u32]).collect();
         let hits = Nearest::new(&lifted, &edges).closest_all(&zeros.points, &settings)?;
         for (i, hit) in hits.iter().enumerate() {
             let cosine = normals[hit.triangle as usize].dot(zeros.normals[i]);
-            back.add(zeros.weights[i], hit.distance(), cosine, zeros.points[i]);
+            back.add(zeros.weights[i], hit.distance(), cosine);
         }
-        for tallied in [&there, &back] {
-            if tallied.max > MAX_DISTANCE * size {
-                worst.push(tallied.worst);
-            }
-        }
+        back.extremes(bar, hits.iter().map(|hit| hit.distance()).zip(zeros.points.iter().copied()));
+        worst.extend([&there, &back].iter().filter(|tallied| tallied.max > bar).map(|tallied| tallied.worst));
         arc_length = along(&curve.parameters, &probes, &landed.ends, pieces);
     }
-    let (there, back) = if compared { (there.one_way(size), back.one_way(size)) } else { (FAR, FAR) };
+    let closeness =
+        if compared { Closeness::both(there.one_way(size), back.one_way(size)) } else { Closeness::nothing() };
     let mut crossed: Vec<usize> = crossing.iter().map(|pair| pair.0 as usize).collect();
     crossed.dedup();
     let places = Places {
@@ -183,15 +181,7 @@ pub fn measure(
         flips: Flips { surface: backwards.len() as u64, sphere: falling, uv: falling },
         self_intersections: crossing.len() as u64,
         degenerate,
-        distance: Distance {
-            mean: 0.5 * (there.mean + back.mean),
-            rms: (0.5 * (there.rms * there.rms + back.rms * back.rms)).sqrt(),
-            max: there.max.max(back.max),
-            surface_to_truth: there,
-            truth_to_surface: back,
-        },
-        normal_consistency: 0.5 * (there.normal_consistency + back.normal_consistency),
-        normal_consistency_signed: 0.5 * (there.normal_consistency_signed + back.normal_consistency_signed),
+        closeness,
         arc_length,
         corners: curve.corners.iter().filter(|c| **c).count() as u64,
         left_out: curve.left_out,
@@ -231,51 +221,13 @@ fn judge(report: &CurveReport, places: &Places) -> Verdict {
     demand(uv == 0, "chart_turned", format!("the parameter does not rise along {uv} edges"), &[]);
     let crossing = report.self_intersections;
     demand(crossing == 0, "self_intersections", format!("{crossing} pairs of edges intersect"), &places.crossing);
-    let (max, deviation) = (report.distance.max, report.arc_length.deviation_max);
-    let far = format!("the largest distance is {:.3} % of the diagonal, over {} %", 100.0 * max, 100.0 * MAX_DISTANCE);
-    demand(max <= MAX_DISTANCE, "distance", far, &places.far);
+    let far = too_far(report.closeness.distance.max);
+    demand(far.is_none(), "distance", far.unwrap_or_default(), &places.far);
+    let deviation = report.arc_length.deviation_max;
     let off =
         format!("the parameter is off arc length by {:.1} %, over {} %", 100.0 * deviation, 100.0 * MAX_DEVIATION);
     demand(deviation <= MAX_DEVIATION, "arc_length", off, &[]);
     verdict
-}
-
-/// Nothing to compare.
-const FAR: OneWay = OneWay { mean: 1.0, rms: 1.0, max: 1.0, normal_consistency: 0.0, normal_consistency_signed: 0.0 };
-
-/// Distances and cosines of normals, weighted, and where the largest distance is.
-#[derive(Default)]
-struct Tallied {
-    weight: f64,
-    sum: f64,
-    squares: f64,
-    cosine: f64,
-    cosine_absolute: f64,
-    max: f64,
-    worst: DVec3,
-}
-
-impl Tallied {
-    fn add(&mut self, weight: f64, distance: f64, cosine: f64, place: DVec3) {
-        self.weight += weight;
-        self.sum += weight * distance;
-        self.squares += weight * distance * distance;
-        self.cosine += weight * cosine;
-        self.cosine_absolute += weight * cosine.abs();
-        if distance > self.max {
-            (self.max, self.worst) = (distance, place);
-        }
-    }
-    fn one_way(&self, diagonal: f64) -> OneWay {
-        let n = self.weight.max(f64::MIN_POSITIVE);
-        OneWay {
-            mean: self.sum / n / diagonal,
-            rms: (self.squares / n).sqrt() / diagonal,
-            max: self.max / diagonal,
-            normal_consistency: self.cosine_absolute / n,
-            normal_consistency_signed: self.cosine / n,
-        }
-    }
 }
 
 /// Unit normal of an edge, away from what is on its left.

@@ -3,8 +3,9 @@
 
 use super::certificate::positions;
 use super::nearest::Nearest;
-use super::report::{Distance, MAX_DISTANCE, OneWay};
+use super::report::{Closeness, MAX_DISTANCE};
 use super::sampling::{Samples, by_area};
+use super::tallied::Tallied;
 use super::truth::Truth;
 use super::zero_set::{self, ZeroSet};
 use super::{corners, diagonal, doubled_normal};
@@ -40,12 +41,8 @@ pub struct Mesh<'a> {
 /// Distances and normal consistency, both ways.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Comparison {
-    /// Distances, in parts of the truth's diagonal.
-    pub distance: Distance,
-    /// Mean over both directions of the mean |n . n'|.
-    pub normal_consistency: f64,
-    /// The same with the sign: n . n'.
-    pub normal_consistency_signed: f64,
+    /// Distances, in parts of the truth's diagonal, and how the normals agree.
+    pub closeness: Closeness,
     /// Places of either side that are farther than [`MAX_DISTANCE`] from the other, scene units: the farthest first, and
     /// of those close together one; at most 16.
     pub far: Vec<DVec3>,
@@ -53,66 +50,18 @@ pub struct Comparison {
     pub worst_places: [DVec3; 2],
 }
 
-/// Distances and cosines of normals from samples of one side, weighted.
-#[derive(Default)]
-struct Tallied {
-    weight: f64,
-    sum: f64,
-    squares: f64,
-    max: f64,
-    worst: DVec3,
-    cosine: f64,
-    cosine_absolute: f64,
-    /// Distance and place of what is farther than the bar.
-    far: Vec<(f64, DVec3)>,
-}
-
-impl Tallied {
-    fn add(&mut self, weight: f64, distance: f64, cosine: f64) {
-        self.weight += weight;
-        self.sum += weight * distance;
-        self.squares += weight * distance * distance;
-        self.cosine += weight * cosine;
-        self.cosine_absolute += weight * cosine.abs();
-    }
-    /// Notes the places whose distance is over `bar`, and the largest distance of all.
-    fn extremes(&mut self, bar: f64, list: impl Iterator<Item = (f64, DVec3)>) {
-        for (distance, place) in list {
-            if distance > self.max {
-                (self.max, self.worst) = (distance, place);
-            }
-            if distance > bar {
-                self.far.push((distance, place));
-            }
-        }
-    }
-    fn one_way(&self, diagonal: f64) -> OneWay {
-        let n = self.weight.max(f64::MIN_POSITIVE);
-        OneWay {
-            mean: self.sum / n / diagonal,
-            rms: (self.squares / n).sqrt() / diagonal,
-            max: self.max / diagonal,
-            normal_consistency: self.cosine_absolute / n,
-            normal_consistency_signed: self.cosine / n,
-        }
+impl Comparison {
+    /// Of nothing that could be compared.
+    pub fn nothing() -> Self {
+        Self { closeness: Closeness::nothing(), ..Self::default() }
     }
 }
 
 fn both(there: Tallied, back: Tallied, size: f64) -> Comparison {
-    let (surface_to_truth, truth_to_surface) = (there.one_way(size), back.one_way(size));
-    let (a, b) = (surface_to_truth, truth_to_surface);
     Comparison {
-        far: thinned([there.far, back.far].concat(), APART * size),
-        distance: Distance {
-            mean: 0.5 * (a.mean + b.mean),
-            rms: (0.5 * (a.rms * a.rms + b.rms * b.rms)).sqrt(),
-            max: a.max.max(b.max),
-            surface_to_truth: a,
-            truth_to_surface: b,
-        },
-        normal_consistency: 0.5 * (a.normal_consistency + b.normal_consistency),
-        normal_consistency_signed: 0.5 * (a.normal_consistency_signed + b.normal_consistency_signed),
+        closeness: Closeness::both(there.one_way(size), back.one_way(size)),
         worst_places: [there.worst, back.worst],
+        far: thinned([there.far, back.far].concat(), APART * size),
     }
 }
 
@@ -282,12 +231,12 @@ mod tests {
         let (a, b) =
             (Mesh { vertices: &inner, triangles: &triangles }, Mesh { vertices: &outer, triangles: &triangles });
         let c = with_settings(2, |s| between(a, b, 5000, s).unwrap().unwrap());
-        for way in [c.distance.surface_to_truth, c.distance.truth_to_surface] {
+        for way in [c.closeness.distance.surface_to_truth, c.closeness.distance.truth_to_surface] {
             assert!((way.mean * UNIT - 0.1).abs() < 1e-3, "{c:?}");
             assert!((way.rms - way.mean).abs() < 1e-3);
         }
-        assert!((c.distance.max * UNIT - 0.1).abs() < 1e-3);
-        assert!(c.normal_consistency > 0.999 && c.normal_consistency_signed > 0.999);
+        assert!((c.closeness.distance.max * UNIT - 0.1).abs() < 1e-3);
+        assert!(c.closeness.normal_consistency > 0.999 && c.closeness.normal_consistency_signed > 0.999);
     }
 
     #[test]
@@ -295,8 +244,8 @@ mod tests {
         let (vertices, triangles) = sphere_mesh(40, 20, 1.0, DVec3::ZERO);
         let mesh = Mesh { vertices: &vertices, triangles: &triangles };
         let c = with_settings(1, |s| between(mesh, mesh, 5000, s).unwrap().unwrap());
-        assert!(c.distance.max < 1e-15, "{c:?}");
-        assert!(c.normal_consistency > 0.9999);
+        assert!(c.closeness.distance.max < 1e-15, "{c:?}");
+        assert!(c.closeness.normal_consistency > 0.9999);
     }
 
     #[test]
@@ -306,7 +255,7 @@ mod tests {
         let (a, b) =
             (Mesh { vertices: &vertices, triangles: &turned }, Mesh { vertices: &vertices, triangles: &triangles });
         let c = with_settings(1, |s| between(a, b, 1000, s).unwrap().unwrap());
-        assert!(c.normal_consistency > 0.9999 && c.normal_consistency_signed < -0.9999);
+        assert!(c.closeness.normal_consistency > 0.9999 && c.closeness.normal_consistency_signed < -0.9999);
     }
 
     #[test]
@@ -317,7 +266,7 @@ mod tests {
         let n = vertices.len() as u32;
         let both: Vec<[u32; 3]> = triangles.iter().copied().chain(triangles.iter().map(|t| t.map(|v| v + n))).collect();
         let (a, b) = (Mesh { vertices: &vertices, triangles: &triangles }, Mesh { vertices: &all, triangles: &both });
-        let Comparison { distance: c, worst_places: worst, .. } =
+        let Comparison { closeness: Closeness { distance: c, .. }, worst_places: worst, .. } =
             with_settings(1, |s| between(a, b, 1000, s).unwrap().unwrap());
         assert!(c.surface_to_truth.max < 1e-15);
         let size = DVec3::new(3.1, 2.0, 2.0).length();
@@ -337,14 +286,14 @@ mod tests {
             let field = Balls { slope, metric, ..Balls::one(0.5) };
             let size = 0.5 * UNIT;
             let c = against_field(&field, 0.52);
-            for way in [c.distance.surface_to_truth, c.distance.truth_to_surface] {
+            for way in [c.closeness.distance.surface_to_truth, c.closeness.distance.truth_to_surface] {
                 assert!((way.mean * size - 0.02).abs() < 5e-4, "{metric:?} {c:?}");
                 assert!((way.max * size - 0.02).abs() < 5e-4, "{metric:?} {c:?}");
             }
-            assert!(c.normal_consistency_signed > 0.999, "{c:?}");
+            assert!(c.closeness.normal_consistency_signed > 0.999, "{c:?}");
             // too far to be traced: the grid's own points answer
             let c = against_field(&field, 0.7);
-            assert!((c.distance.surface_to_truth.mean * size - 0.2).abs() < 1e-3, "{metric:?} {c:?}");
+            assert!((c.closeness.distance.surface_to_truth.mean * size - 0.2).abs() < 1e-3, "{metric:?} {c:?}");
         }
     }
 
@@ -353,7 +302,7 @@ mod tests {
         let field = Balls { balls: vec![(Vec3::ZERO, 0.5), (Vec3::X * 0.9, 0.05)], slope: 1.0, metric: Metric::Bound };
         let c = against_field(&field, 0.5);
         let size = DVec3::new(1.45, 1.0, 1.0).length();
-        assert!((c.distance.truth_to_surface.max * size - 0.45).abs() < 2e-3, "{c:?}");
-        assert!(c.distance.surface_to_truth.max < 1e-3);
+        assert!((c.closeness.distance.truth_to_surface.max * size - 0.45).abs() < 2e-3, "{c:?}");
+        assert!(c.closeness.distance.surface_to_truth.max < 1e-3);
     }
 }

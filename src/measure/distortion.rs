@@ -18,15 +18,21 @@ pub fn distortions(surface: &Surface) -> Distortions {
     };
     let sphere =
         surface.triangles.iter().map(|t| (flatten(t.map(|v| surface.lattice.directions[v as usize])), triangle(t)));
-    // welded and chart triangles are in the same order; v points down, so it is turned up
-    let uv = surface.chart_triangles.iter().zip(&surface.triangles).map(|(c, t)| {
-        let place = c.map(|v| {
-            let [u, v] = surface.lattice.uv[v as usize];
-            DVec2::new(aspect * u, -v)
-        });
-        (place, triangle(t))
-    });
-    Distortions { sphere: distortion(sphere), uv: distortion(uv) }
+    let chart = |uv: &[[f64; 2]]| {
+        // welded and chart triangles are in the same order; v points down, so it is turned up
+        distortion(surface.chart_triangles.iter().zip(&surface.triangles).map(|(c, t)| {
+            let place = c.map(|v| {
+                let [u, v] = uv[v as usize];
+                DVec2::new(aspect * u, -v)
+            });
+            (place, triangle(t))
+        }))
+    };
+    Distortions {
+        sphere: distortion(sphere),
+        uv: chart(surface.uv()),
+        uv_before: surface.relaxed_uv.as_ref().map(|_| chart(&surface.lattice.uv)),
+    }
 }
 
 /// Distortion of a piecewise linear map given by its triangles, in the domain's plane and in space. The domain is scaled

@@ -1,13 +1,14 @@
 //! Everything that can be said of any mesh beside its truth, whoever made it; `docs/metrics.md` has the definitions.
 
 use super::baseline::{FILL, PAPER_SIDE, cubes_at, side_for};
-use super::certificate::{crossings, surface_flips, topology};
+use super::certificate::{Topology, crossings, surface_flips, topology};
 use super::chamfer::{Chamfer, chamfer};
 use super::chart::{ChartFigures, SphereChart, chart_figures};
 use super::distance::{Comparison, FIELD_SAMPLES, Mesh, SAMPLES};
-use super::report::{Distance, MAX_DISTANCE};
+use super::report::{Closeness, Flips};
 use super::sampling::by_area;
 use super::truth::Truth;
+use super::verdict;
 use crate::field::mesh::ChartedMesh;
 use crate::settings::Canceled;
 use glam::DVec3;
@@ -38,14 +39,11 @@ pub struct Figures {
     pub degenerate: u64,
     /// Pairs of triangles that meet in more than what they share, by exact predicates.
     pub self_intersections: u64,
-    /// Distances, in parts of the truth's diagonal; all 1 when there is nothing to compare.
-    pub distance: Distance,
+    /// Distances, in parts of the truth's diagonal, all 1 when there is nothing to compare; and how face normals agree.
+    #[serde(flatten)]
+    pub closeness: Closeness,
     /// Where the largest distances were met, scene units: on this mesh, on the truth.
     pub worst_places: [[f64; 3]; 2],
-    /// Mean of |n . n'| over both directions, face normals.
-    pub normal_consistency: f64,
-    /// Mean of n . n'.
-    pub normal_consistency_signed: f64,
     /// The field's own |value| at samples of this mesh, in parts of the truth's diagonal. A distance only where the field is one.
     pub values: Values,
     /// Sample-to-sample measures with the longest side of the truth at 0.9 (NDC); only against a mesh.
@@ -88,28 +86,18 @@ impl Evaluation {
     /// One sentence for every condition that does not hold.
     pub fn succeeds(&self) -> Result<(), Vec<String>> {
         let (surface, chart) = (&self.surface, self.parameterization.as_ref());
-        let charts = chart.map_or(0, |c| c.charts);
-        let turned = chart.and_then(|c| c.sphere_flips).unwrap_or(0);
-        let mirrored = chart.map_or(0, |c| c.uv_flips);
-        let max = surface.distance.max;
-        let conditions = [
-            (surface.closed, "the surface is not closed".to_owned()),
-            (surface.euler == 2, format!("the Euler number is {} instead of 2", surface.euler)),
-            (charts == 1, format!("there are {charts} charts instead of 1")),
-            (surface.flips == 0, format!("{} triangles are folded over on the surface", surface.flips)),
-            (turned == 0, format!("{turned} triangles are turned over on the sphere")),
-            (mirrored == 0, format!("{mirrored} triangles are turned over in the chart")),
-            (surface.self_intersections == 0, format!("{} pairs of triangles intersect", surface.self_intersections)),
-            (
-                max <= MAX_DISTANCE,
-                format!(
-                    "the largest distance is {:.3} % of the diagonal, over {} %",
-                    100.0 * max,
-                    100.0 * MAX_DISTANCE
-                ),
-            ),
-        ];
-        let faults: Vec<String> = conditions.into_iter().filter(|c| !c.0).map(|c| c.1).collect();
+        let figures = verdict::Figures {
+            topology: Topology { closed: surface.closed, euler: surface.euler, components: surface.components },
+            charts: chart.map_or(0, |c| c.charts),
+            flips: Flips {
+                surface: surface.flips,
+                sphere: chart.and_then(|c| c.sphere_flips).unwrap_or(0),
+                uv: chart.map_or(0, |c| c.uv_flips),
+            },
+            self_intersections: surface.self_intersections,
+            max_distance: surface.closeness.distance.max,
+        };
+        let faults: Vec<String> = figures.misses().into_iter().map(|(_, detail)| detail).collect();
         if faults.is_empty() { Ok(()) } else { Err(faults) }
     }
 }
@@ -153,10 +141,7 @@ fn figures(mesh: Mesh<'_>, truth: &Truth<'_, '_>, ndc_scale: f64) -> Result<Figu
     let shape = topology(mesh.vertices.len(), mesh.triangles);
     let (folded, degenerate) = surface_flips(mesh.vertices, mesh.triangles, sampler)?;
     let (self_intersections, _) = crossings(mesh.vertices, mesh.triangles, settings)?;
-    let comparison = truth.compare(mesh)?.unwrap_or_else(|| Comparison {
-        distance: Distance { mean: 1.0, rms: 1.0, max: 1.0, ..Distance::default() },
-        ..Comparison::default()
-    });
+    let comparison = truth.compare(mesh)?.unwrap_or_else(Comparison::nothing);
     let to_ndc = |vertices: &[DVec3]| -> Vec<DVec3> { vertices.iter().map(|&p| ndc_scale * p).collect() };
     let chamfer = match truth.mesh() {
         None => None,
@@ -177,10 +162,8 @@ fn figures(mesh: Mesh<'_>, truth: &Truth<'_, '_>, ndc_scale: f64) -> Result<Figu
         flips: folded.len() as u64,
         degenerate,
         self_intersections,
-        distance: comparison.distance,
+        closeness: comparison.closeness,
         worst_places: comparison.worst_places.map(|p| p.to_array()),
-        normal_consistency: comparison.normal_consistency,
-        normal_consistency_signed: comparison.normal_consistency_signed,
         values: values(mesh, truth, diagonal)?,
         chamfer,
     })
@@ -224,7 +207,7 @@ mod tests {
             let chart = SphereChart::named_in(&charted.extras);
             let found = evaluate(mesh, Some((&charted, chart)), &truth, true).unwrap().unwrap();
             assert_eq!(found.succeeds(), Ok(()));
-            let (surface, there) = (found.surface, found.surface.distance.surface_to_truth);
+            let (surface, there) = (found.surface, found.surface.closeness.distance.surface_to_truth);
             assert!((surface.values.mean / there.mean - 1.0).abs() < 0.05, "{surface:?}");
             assert!(surface.values.max <= there.max * 1.0001, "{surface:?}");
             assert_eq!((found.truth, surface.chamfer), (None, None), "no mesh to sample");
@@ -259,12 +242,12 @@ mod tests {
                 // spheres of radius 0.45 in NDC, 2 % apart
                 assert!((cd.cd1 / 2.0 / 0.009 - 1.0).abs() < 0.05, "{cd:?}");
                 assert!(floor.cd2 < 0.1 * cd.cd2 && floor.cd2 > 0.0);
-                assert!(found.truth.unwrap().distance.max < 1e-15, "nothing but rounding");
+                assert!(found.truth.unwrap().closeness.distance.max < 1e-15, "nothing but rounding");
                 assert!(found.marching_cubes.is_empty());
                 let faults = found.succeeds().unwrap_err();
                 assert!(faults.iter().any(|f| f.contains("0 charts")), "{faults:?}");
             }
-            assert!((small.surface.distance.mean - large.surface.distance.mean).abs() < 1e-6);
+            assert!((small.surface.closeness.distance.mean - large.surface.closeness.distance.mean).abs() < 1e-6);
         });
     }
 }

@@ -35,6 +35,7 @@ pub(crate) fn surface_of(spec: LatticeSpec, place: impl Fn(DVec3) -> (DVec3, DVe
         triangles: lattice.triangles(&diagonals),
         chart_triangles: lattice.chart_triangles(&diagonals),
         lattice,
+        relaxed_uv: None,
     }
 }
 

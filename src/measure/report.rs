@@ -1,9 +1,9 @@
 //! The report: every figure of a result, measured. Definitions are in `docs/metrics.md`.
 
-use super::certificate::certify;
-use super::distance::to_truth;
+use super::certificate::{certify, uv_flips};
+use super::distance::{Comparison, to_truth};
 use super::distortion::distortions;
-use super::verdict::{Verdict, judge};
+use super::verdict::{Figures, Verdict, judge};
 use crate::field::sampler::Tally;
 use crate::field::{Counts, Sampler};
 use crate::settings::Canceled;
@@ -38,12 +38,9 @@ pub struct Report {
     pub self_intersections: u64,
     /// Triangles of exactly no area.
     pub degenerate: u64,
-    /// Distances between surface and truth, in parts of the truth's bounding-box diagonal, both ways.
-    pub distance: Distance,
-    /// Mean of |n . n'| over both directions, face normals.
-    pub normal_consistency: f64,
-    /// Mean of n . n' over both directions, face normals.
-    pub normal_consistency_signed: f64,
+    /// Distances between surface and truth, and how the normals agree.
+    #[serde(flatten)]
+    pub closeness: Closeness,
     /// Distortion of the parameterization.
     pub distortion: Distortions,
     /// Wall-clock seconds by part of the job; filled in by the caller, who has a clock.
@@ -85,10 +82,7 @@ pub fn measure(
     let own = Tally::new();
     let sampler = Sampler::new(sampler.field(), *sampler.settings(), &own);
     let certificate = certify(surface, &sampler)?;
-    let comparison = to_truth(surface, &sampler)?.unwrap_or_else(|| super::distance::Comparison {
-        distance: Distance { mean: 1.0, rms: 1.0, max: 1.0, ..Distance::default() },
-        ..Default::default()
-    });
+    let comparison = to_truth(surface, &sampler)?.unwrap_or_else(Comparison::nothing);
     let vertices = surface.positions.len() as u64;
     Ok(Report {
         vertices,
@@ -100,9 +94,7 @@ pub fn measure(
         flips: certificate.flips,
         self_intersections: certificate.self_intersections,
         degenerate: certificate.degenerate,
-        distance: comparison.distance,
-        normal_consistency: comparison.normal_consistency,
-        normal_consistency_signed: comparison.normal_consistency_signed,
+        closeness: comparison.closeness,
         distortion: distortions(surface),
         seconds: Seconds::default(),
         threads: sampler.settings().pool.current_num_threads() as u64,
@@ -114,6 +106,21 @@ pub fn measure(
         verdict: judge(&certificate, &comparison, vertices),
         version: env!("CARGO_PKG_VERSION").to_owned(),
     })
+}
+
+impl Report {
+    /// Measures the chart anew, after it was relaxed: its flips, its distortion, and the verdict on both.
+    pub fn measure_chart(&mut self, surface: &Surface) {
+        self.flips.uv = uv_flips(surface);
+        self.distortion = distortions(surface);
+        let code = "chart_turned";
+        self.verdict.faults.retain(|fault| fault.code != code);
+        self.verdict.passed = self.verdict.faults.is_empty();
+        let figures = Figures { flips: Flips { uv: self.flips.uv, ..Flips::default() }, ..Figures::SOUND };
+        for (code, detail) in figures.misses() {
+            self.verdict.fail(code, detail, &[]);
+        }
+    }
 }
 
 /// Whether a result succeeds by the whole bar, also where its lattice is too coarse to be held to it: closed, Euler 2, one
@@ -165,6 +172,41 @@ pub struct Flips {
     pub uv: u64,
 }
 
+/// How close a surface or a curve and its truth are, and how their normals agree, both ways.
+#[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
+pub struct Closeness {
+    /// Distances, in parts of the truth's bounding-box diagonal, both ways.
+    pub distance: Distance,
+    /// Mean of |n . n'| over both directions: normals of faces, or of a curve's edges.
+    pub normal_consistency: f64,
+    /// Mean of n . n' over both directions.
+    pub normal_consistency_signed: f64,
+}
+
+impl Closeness {
+    /// Puts both directions together.
+    pub fn both(surface_to_truth: OneWay, truth_to_surface: OneWay) -> Self {
+        let (a, b) = (surface_to_truth, truth_to_surface);
+        Self {
+            distance: Distance {
+                mean: 0.5 * (a.mean + b.mean),
+                rms: (0.5 * (a.rms * a.rms + b.rms * b.rms)).sqrt(),
+                max: a.max.max(b.max),
+                surface_to_truth,
+                truth_to_surface,
+            },
+            normal_consistency: 0.5 * (a.normal_consistency + b.normal_consistency),
+            normal_consistency_signed: 0.5 * (a.normal_consistency_signed + b.normal_consistency_signed),
+        }
+    }
+
+    /// Of nothing that could be compared: the whole diagonal away, no normals that agree.
+    pub fn nothing() -> Self {
+        let far = OneWay { mean: 1.0, rms: 1.0, max: 1.0, ..OneWay::default() };
+        Self::both(far, far)
+    }
+}
+
 /// Distances, in parts of the bounding-box diagonal of the truth.
 #[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
 pub struct Distance {
@@ -202,6 +244,9 @@ pub struct Distortions {
     pub sphere: Distortion,
     /// From the UV square.
     pub uv: Distortion,
+    /// From the UV square before `relax_uv`: where the vertices' places on the sphere are. Only where it was asked for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub uv_before: Option<Distortion>,
 }
 
 /// Distortion of one map, areas matched globally; s1 >= s2 are the singular values per triangle.
@@ -260,7 +305,7 @@ mod tests {
         let surface = sphere_surface(LatticeSpec::default(), 0.5);
         let found = report(&surface, 2);
         assert_eq!(passes(&found), Ok(()));
-        assert!(found.distance.max < 5e-4 && found.normal_consistency_signed > 0.999, "{found:?}");
+        assert!(found.closeness.distance.max < 5e-4 && found.closeness.normal_consistency_signed > 0.999, "{found:?}");
         assert_eq!((found.evaluations.value, found.evaluations.gradient), (1000, 500));
         assert!((found.evaluations.per_vertex - 1500.0 / 19802.0).abs() < 1e-12);
         let one = Report { threads: 2, ..report(&surface, 1) };
@@ -284,6 +329,6 @@ mod tests {
         let text = serde_json::to_string(&found).unwrap();
         let back: Report = serde_json::from_str(&text).unwrap();
         assert_eq!(back.flips, found.flips);
-        assert!((back.distance.mean - found.distance.mean).abs() < 1e-15);
+        assert!((back.closeness.distance.mean - found.closeness.distance.mean).abs() < 1e-15);
     }
 }

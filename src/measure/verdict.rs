@@ -2,7 +2,7 @@
 //!
 //! A fault makes a result fail. A warning says that a figure is outside its bar for a reason that lies in the request.
 
-use super::certificate::Certificate;
+use super::certificate::{Certificate, Topology};
 use super::distance::Comparison;
 use super::report::{Flips, MAX_DISTANCE};
 use glam::DVec3;
@@ -63,38 +63,84 @@ fn finding(code: &str, detail: String, places: &[DVec3]) -> Finding {
     Finding { code: code.to_owned(), detail, places: places.iter().map(DVec3::to_array).collect() }
 }
 
-/// Judges a surface of so many vertices: closed, Euler 2, one chart, no flip of any kind, no self-intersection, and nowhere
-/// farther than [`MAX_DISTANCE`] of the diagonal from the truth, both ways.
+/// The figures that a surface is judged by.
+#[derive(Clone, Copy, Debug)]
+pub struct Figures {
+    /// Whether it is closed, and its Euler number.
+    pub topology: Topology,
+    /// Charts.
+    pub charts: u64,
+    /// Folded triangles.
+    pub flips: Flips,
+    /// Pairs of triangles that intersect.
+    pub self_intersections: u64,
+    /// Largest distance both ways, in parts of the diagonal.
+    pub max_distance: f64,
+}
+
+impl Figures {
+    /// Those of a surface with nothing wrong.
+    pub const SOUND: Self = Self {
+        topology: Topology { closed: true, euler: 2, components: 1 },
+        charts: 1,
+        flips: Flips { surface: 0, sphere: 0, uv: 0 },
+        self_intersections: 0,
+        max_distance: 0.0,
+    };
+
+    /// The conditions of success that do not hold, by code and sentence: closed, Euler 2, one chart, no flip of any kind, no
+    /// self-intersection, and nowhere farther than [`MAX_DISTANCE`] of the diagonal from the truth, both ways.
+    pub fn misses(&self) -> Vec<(&'static str, String)> {
+        let Self { topology: Topology { closed, euler, .. }, charts, self_intersections: pairs, .. } = *self;
+        let Flips { surface, sphere, uv } = self.flips;
+        let far = too_far(self.max_distance);
+        [
+            (closed, "not_closed", "the surface is not closed".to_owned()),
+            (euler == 2, "euler", format!("the Euler number is {euler} instead of 2")),
+            (charts == 1, "charts", format!("there are {charts} charts instead of 1")),
+            (surface == 0, "folded", format!("{surface} triangles are folded over on the surface")),
+            (sphere == 0, "sphere_turned", format!("{sphere} triangles are turned over on the sphere")),
+            (uv == 0, "chart_turned", format!("{uv} triangles are turned over in the chart")),
+            (pairs == 0, "self_intersections", format!("{pairs} pairs of triangles intersect")),
+            (far.is_none(), "distance", far.unwrap_or_default()),
+        ]
+        .into_iter()
+        .filter_map(|(holds, code, detail)| (!holds).then_some((code, detail)))
+        .collect()
+    }
+}
+
+/// What is said of a largest distance over [`MAX_DISTANCE`].
+pub fn too_far(max: f64) -> Option<String> {
+    // written so that NaN is a miss
+    let near = matches!(max.partial_cmp(&MAX_DISTANCE), Some(std::cmp::Ordering::Less | std::cmp::Ordering::Equal));
+    let (found, bar) = (100.0 * max, 100.0 * MAX_DISTANCE);
+    (!near).then(|| format!("the largest distance is {found:.3} % of the diagonal, over {bar} %"))
+}
+
+/// Judges a surface of so many vertices by [`Figures::misses`]. One that is too coarse for the bar of distances is warned.
 pub fn judge(certificate: &Certificate, comparison: &Comparison, vertices: u64) -> Verdict {
     let mut verdict = Verdict { passed: true, ..Verdict::default() };
-    let mut demand = |holds: bool, code: &str, detail: String, places: &[DVec3]| {
-        if !holds {
-            verdict.fail(code, detail, places);
-        }
+    let max = comparison.closeness.distance.max;
+    let figures = Figures {
+        topology: certificate.topology,
+        charts: certificate.charts,
+        flips: certificate.flips,
+        self_intersections: certificate.self_intersections,
+        max_distance: max,
     };
-    let topology = certificate.topology;
-    demand(topology.closed, "not_closed", "the surface is not closed".to_owned(), &[]);
-    demand(topology.euler == 2, "euler", format!("the Euler number is {} instead of 2", topology.euler), &[]);
-    let charts = certificate.charts;
-    demand(charts == 1, "charts", format!("there are {charts} charts instead of 1"), &[]);
-    let Flips { surface, sphere, uv } = certificate.flips;
-    let folded = format!("{surface} triangles are folded over on the surface");
-    demand(surface == 0, "folded", folded, &certificate.flip_places);
-    demand(sphere == 0, "sphere_turned", format!("{sphere} triangles are turned over on the sphere"), &[]);
-    demand(uv == 0, "chart_turned", format!("{uv} triangles are turned over in the chart"), &[]);
-    let crossing = certificate.self_intersections;
-    let meet = format!("{crossing} pairs of triangles intersect");
-    demand(crossing == 0, "self_intersections", meet, &certificate.intersection_places);
-    let max = comparison.distance.max;
-    // written so that NaN is a miss
-    if !matches!(max.partial_cmp(&MAX_DISTANCE), Some(std::cmp::Ordering::Less | std::cmp::Ordering::Equal)) {
-        let (found, bar) = (100.0 * max, 100.0 * MAX_DISTANCE);
-        let detail = format!("the largest distance is {found:.3} % of the diagonal, over {bar} %");
-        if vertices < FINE_ENOUGH && max <= edge(vertices) {
+    for (code, detail) in figures.misses() {
+        let places: &[DVec3] = match code {
+            "folded" => &certificate.flip_places,
+            "self_intersections" => &certificate.intersection_places,
+            "distance" => &comparison.far,
+            _ => &[],
+        };
+        if code == "distance" && vertices < FINE_ENOUGH && max <= edge(vertices) {
             let detail = format!("{detail}, which a lattice of {vertices} vertices is not held to");
-            verdict.warnings.push(finding("distance", detail, &comparison.far));
+            verdict.warnings.push(finding(code, detail, places));
         } else {
-            verdict.fail("distance", detail, &comparison.far);
+            verdict.fail(code, detail, places);
         }
     }
     verdict
@@ -102,8 +148,7 @@ pub fn judge(certificate: &Certificate, comparison: &Comparison, vertices: u64) 
 
 #[cfg(test)]
 mod tests {
-    use super::super::certificate::Topology;
-    use super::super::report::Distance;
+    use super::super::report::{Closeness, Distance};
     use super::*;
 
     fn sound() -> Certificate {
@@ -116,7 +161,8 @@ mod tests {
 
     fn at_distance(max: f64) -> Comparison {
         let far = if max > MAX_DISTANCE { vec![DVec3::X] } else { Vec::new() };
-        Comparison { distance: Distance { max, ..Distance::default() }, far, ..Comparison::default() }
+        let closeness = Closeness { distance: Distance { max, ..Distance::default() }, ..Closeness::default() };
+        Comparison { closeness, far, ..Comparison::default() }
     }
 
     #[test]

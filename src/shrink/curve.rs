@@ -133,7 +133,7 @@ impl Samples {
 ///
 /// # Errors
 /// [`ShrinkError::Dimension`] for a field of dimension 3, [`ShrinkError::Canceled`] when the run was canceled, and for
-/// `method: adaptive` [`ShrinkError::Empty`], [`ShrinkError::Components`] and [`ShrinkError::Genus`] (the number of holes) when the
+/// `method: adaptive` [`ShrinkError::Empty`], [`ShrinkError::Components`] and [`ShrinkError::Holes`] when the
 /// zero set is not one loop. `method: paper` returns what comes out, as long as there is a zero set.
 pub fn shrink_curve(sampler: &Sampler<'_>, spec: &CurveSpec, effort: &Effort) -> Result<Curve, ShrinkError> {
     let found = sampler.field().dimension();
@@ -226,7 +226,7 @@ fn chosen(mut loops: Vec<Loop>, spec: &CurveSpec, frame: Frame) -> Result<(Loop,
     };
     if !part.holes.is_empty() && spec.on_topology == OnTopology::Refuse {
         let holes = &mut part.holes.iter().copied();
-        return Err(ShrinkError::Genus { genus: part.holes.len(), places: places(holes, 1.0) });
+        return Err(ShrinkError::Holes { count: part.holes.len(), places: places(holes, 1.0) });
     }
     let area = |&h: &usize| -0.5 * double_area(&loops[h].points) * frame.scale * frame.scale;
     let left_out = LeftOut {

@@ -145,15 +145,15 @@ pub fn newton_direction(gradient: DVec3, hessian: &DMat3, shift: f64, e1: DVec3,
 
 /// Newton step in a plane with the Hessian `[a b; b c]`, its eigenvalues made positive.
 pub fn planar_newton_step(gradient: DVec2, a: f64, b: f64, c: f64) -> DVec2 {
-    let inverse = inverse_positive(a, b, c);
+    let inverse = inverse_positive(DMat2::from_cols(DVec2::new(a, b), DVec2::new(b, c)));
     -(inverse * gradient)
 }
 
-/// The inverse of the symmetric matrix `[a b; b c]` with its eigenvalues made positive and none much smaller than the
-/// other.
-pub fn inverse_positive(a: f64, b: f64, c: f64) -> DMat2 {
+/// The inverse of a symmetric matrix with its eigenvalues made positive and none much smaller than the other.
+pub fn inverse_positive(m: DMat2) -> DMat2 {
     /// Smallest eigenvalue kept, relative to the largest.
     const FLOOR: f64 = 1e-3;
+    let (a, b, c) = (m.x_axis.x, m.x_axis.y, m.y_axis.y);
     let (mean, radius) = (0.5 * (a + c), (0.25 * (a - c) * (a - c) + b * b).sqrt());
     let (large, small) = (mean + radius, mean - radius);
     let floor = FLOOR * large.abs().max(small.abs()) + 1e-300;

@@ -9,7 +9,7 @@
 
 mod decimate;
 mod level;
-mod newton;
+pub(super) mod newton;
 mod star;
 
 use super::energy::{Objective, Reference};

@@ -409,6 +409,7 @@ mod tests {
         lattice: super::super::lattice::LatticeSpec::Octahedral { n: 8 },
         density: super::super::Density::Area,
         distortion: super::super::Distortion::Isometric,
+        relax_uv: false,
         on_topology: OnTopology::Wrap,
         component: None,
         samples: None,

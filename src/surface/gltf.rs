@@ -1,7 +1,8 @@
 //! A surface as binary glTF: one mesh, one primitive, one material with an embedded checkerboard.
 //!
 //! Positions are scene units as they are; no axis is turned (glTF viewers take +y as up). Vertices are the chart's, so the seam is
-//! doubled and every polar sector has a pole of its own. The same surface and the same JSON give the same bytes.
+//! doubled and every polar sector has a pole of its own. Where the chart was relaxed, `TEXCOORD_0` is what it became and `TEXCOORD_1`
+//! the place on the sphere. The same surface and the same JSON give the same bytes.
 
 use super::Surface;
 use super::checkerboard::{Tiles, texture};
@@ -85,7 +86,7 @@ pub fn to_glb(surface: &Surface, report: &Value, provenance: &Value) -> Vec<u8> 
     let lattice = &surface.lattice;
     let positions: Vec<[f32; 3]> = lattice.chart.iter().map(|&v| surface.positions[v as usize]).collect();
     let normals: Vec<[f32; 3]> = lattice.chart.iter().map(|&v| unit(surface.normals[v as usize])).collect();
-    let uvs: Vec<[f32; 2]> = lattice.uv.iter().map(|&[u, v]| [u as f32, v as f32]).collect();
+    let single = |uv: &[[f64; 2]]| -> Vec<u8> { uv.iter().flatten().flat_map(|&c| (c as f32).to_le_bytes()).collect() };
     let corners = surface.chart_triangles.iter().flatten();
     let (index_bytes, index_type): (Vec<u8>, ComponentType) = if positions.len() <= LAST_SHORT + 1 {
         (corners.flat_map(|&v| (v as u16).to_le_bytes()).collect(), ComponentType::U16)
@@ -99,7 +100,7 @@ pub fn to_glb(surface: &Surface, report: &Value, provenance: &Value) -> Vec<u8> 
         [0, 1].map(|side| std::array::from_fn(|k| if side == 0 { lo[k].min(p[k]) } else { hi[k].max(p[k]) }))
     });
     let mut attributes = BTreeMap::new();
-    for (semantic, bytes, kind, range, name) in [
+    let mut written = vec![
         (
             json::mesh::Semantic::Positions,
             little_endian(&positions),
@@ -108,8 +109,12 @@ pub fn to_glb(surface: &Surface, report: &Value, provenance: &Value) -> Vec<u8> 
             "positions",
         ),
         (json::mesh::Semantic::Normals, little_endian(&normals), Type::Vec3, None, "normals"),
-        (json::mesh::Semantic::TexCoords(0), little_endian(&uvs), Type::Vec2, None, "uv"),
-    ] {
+        (json::mesh::Semantic::TexCoords(0), single(surface.uv()), Type::Vec2, None, "uv"),
+    ];
+    if surface.relaxed_uv.is_some() {
+        written.push((json::mesh::Semantic::TexCoords(1), single(&lattice.uv), Type::Vec2, None, "sphere"));
+    }
+    for (semantic, bytes, kind, range, name) in written {
         let view = buffer.push(&bytes, Some(Target::ArrayBuffer), name);
         let entry = accessor(view, positions.len(), ComponentType::F32, kind, range, name);
         attributes.insert(Valid(semantic), Index::push(&mut accessors, entry));

@@ -23,7 +23,7 @@ pub fn to_png(surface: &Surface, width: u32, settings: &Settings<'_>) -> Result<
     let chart = &surface.lattice.chart;
     let positions: Vec<Vec3> = chart.iter().map(|&v| Vec3::from(surface.positions[v as usize])).collect();
     let normals: Vec<Vec3> = chart.iter().map(|&v| Vec3::from(surface.normals[v as usize])).collect();
-    let uv: Vec<[f32; 2]> = surface.lattice.uv.iter().map(|&[u, v]| [u as f32, v as f32]).collect();
+    let uv: Vec<[f32; 2]> = surface.uv().iter().map(|&[u, v]| [u as f32, v as f32]).collect();
     let model = Model {
         positions: &positions,
         normals: &normals,

@@ -4,12 +4,20 @@
 //! |---|---|---|
 //! | `positions` | [rows, columns, 3] | f32, scene units |
 //! | `normals` | [rows, columns, 3] | f32, unit gradients |
-//! | `uv` | [rows, columns, 2] | f32, v downwards |
+//! | `uv` | [rows, columns, 2] | f32, the place on the sphere, v downwards |
 //! | `gradient_norm`, `value` | [rows, columns] | f32 |
 //! | `first_form` | [rows, columns, 3] | f32: E, F, G (see [`forms`](super::forms)) |
 //! | `second_form` | [rows, columns, 3] | f32: L, M, N |
 //! | `vertex` | [rows, columns] | u32, the welded vertex of each grid point |
 //! | `triangles` | [n, 3] | u32, welded vertices, counter-clockwise outward |
+//!
+//! A surface whose chart was relaxed has three more, over the vertices of the chart (m of them):
+//!
+//! | tensor | shape | type |
+//! |---|---|---|
+//! | `chart_uv` | [m, 2] | f32, relaxed, v downwards |
+//! | `chart_vertex` | \[m\] | u32, the welded vertex of each |
+//! | `chart_triangles` | [n, 3] | u32, chart vertices, in the order of `triangles` |
 //!
 //! The metadata has one entry, `shrinkd`: JSON with `format`, `version`, `lattice`, `rows`, `columns`, `vertices` and
 //! `coordinates` (what the forms are taken by). The same surface gives the same bytes.
@@ -18,7 +26,7 @@ use super::Surface;
 use super::forms::forms;
 use crate::shrink::lattice::LatticeSpec;
 use safetensors::tensor::{Dtype, TensorView};
-use serde_json::json;
+use serde_json::{Value, json};
 use std::collections::HashMap;
 
 /// Version of the layout above.
@@ -41,7 +49,7 @@ pub fn to_safetensors(surface: &Surface) -> Vec<u8> {
         .flat_map(f32::to_le_bytes)
         .collect();
     let whole = |values: &mut dyn Iterator<Item = u32>| -> Vec<u8> { values.flat_map(u32::to_le_bytes).collect() };
-    let tensors: Vec<(&str, Dtype, Vec<usize>, Vec<u8>)> = vec![
+    let mut tensors: Vec<Tensor> = vec![
         ("positions", Dtype::F32, vec![rows, columns, 3], on_grid(&surface.positions)),
         ("normals", Dtype::F32, vec![rows, columns, 3], on_grid(&surface.normals)),
         ("uv", Dtype::F32, vec![rows, columns, 2], uv),
@@ -57,6 +65,14 @@ pub fn to_safetensors(surface: &Surface) -> Vec<u8> {
             whole(&mut surface.triangles.iter().flatten().copied()),
         ),
     ];
+    if let Some(uv) = &surface.relaxed_uv {
+        let places = uv.iter().flatten().flat_map(|&c| (c as f32).to_le_bytes()).collect();
+        let triangles = &surface.chart_triangles;
+        tensors.push(("chart_uv", Dtype::F32, vec![uv.len(), 2], places));
+        tensors.push(("chart_vertex", Dtype::U32, vec![uv.len()], whole(&mut lattice.chart.iter().copied())));
+        let corners = whole(&mut triangles.iter().flatten().copied());
+        tensors.push(("chart_triangles", Dtype::U32, vec![triangles.len(), 3], corners));
+    }
     let about = json!({
         "format": FORMAT,
         "version": env!("CARGO_PKG_VERSION"),
@@ -69,6 +85,17 @@ pub fn to_safetensors(surface: &Surface) -> Vec<u8> {
             LatticeSpec::Octahedral { .. } => ["u", "v"],
         },
     });
+    file(&tensors, &about)
+}
+
+/// A tensor before it is written: name, type, shape, and its bytes, little-endian.
+pub(super) type Tensor = (&'static str, Dtype, Vec<usize>, Vec<u8>);
+
+/// Tensors and the metadata's one entry as a safetensors file.
+///
+/// # Panics
+/// When a tensor has not as many bytes as its shape says.
+pub(super) fn file(tensors: &[Tensor], about: &Value) -> Vec<u8> {
     // one entry: the order of several would change from run to run
     let metadata = HashMap::from([("shrinkd".to_owned(), about.to_string())]);
     let views = tensors.iter().map(|(name, dtype, shape, data)| {

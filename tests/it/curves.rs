@@ -1,6 +1,7 @@
 //! Two-dimensional fields: over HTTP, on the command line, and as good as they were.
 
 use crate::app::{App, BINARY, state};
+use crate::losses::{Losses, count, number};
 use reqwest::StatusCode;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -171,37 +172,30 @@ const NOISE: f64 = 1e-6;
 
 impl Metrics {
     fn of(report: &Value) -> Self {
-        let number = |pointer: &str| report.pointer(pointer).and_then(Value::as_f64).expect("a number");
         Self {
-            vertices: report["vertices"].as_u64().expect("a count"),
-            corners: report["corners"].as_u64().expect("a count"),
-            distance_mean: number("/distance/mean"),
-            distance_max: number("/distance/max"),
-            normal_consistency: number("/normal_consistency"),
-            arc_length_deviation: number("/arc_length/deviation_max"),
-            evaluations_per_vertex: number("/evaluations/per_vertex"),
+            vertices: count(report, "/vertices"),
+            corners: count(report, "/corners"),
+            distance_mean: number(report, "/distance/mean"),
+            distance_max: number(report, "/distance/max"),
+            normal_consistency: number(report, "/normal_consistency"),
+            arc_length_deviation: number(report, "/arc_length/deviation_max"),
+            evaluations_per_vertex: number(report, "/evaluations/per_vertex"),
         }
     }
 
     /// What got worse.
     fn losses(&self, stored: &Metrics) -> Vec<String> {
-        let mut losses = Vec::new();
-        let mut at_most = |what: &str, found: f64, limit: f64| {
-            // written so that NaN is a loss
-            if !matches!(found.partial_cmp(&limit), Some(std::cmp::Ordering::Less | std::cmp::Ordering::Equal)) {
-                losses.push(format!("{what} is {found}, over {limit}"));
-            }
-        };
+        let mut losses = Losses::default();
         let limit = |stored: f64| stored * (1.0 + WORSE) + NOISE;
-        at_most("mean distance", self.distance_mean, limit(stored.distance_mean));
-        at_most("largest distance", self.distance_max, limit(stored.distance_max));
-        at_most("1 - NC", 1.0 - self.normal_consistency, limit(1.0 - stored.normal_consistency));
-        at_most("arc length deviation", self.arc_length_deviation, limit(stored.arc_length_deviation) + 1e-5);
-        at_most("evaluations", self.evaluations_per_vertex, limit(stored.evaluations_per_vertex));
+        losses.at_most("mean distance", self.distance_mean, limit(stored.distance_mean));
+        losses.at_most("largest distance", self.distance_max, limit(stored.distance_max));
+        losses.at_most("1 - NC", 1.0 - self.normal_consistency, limit(1.0 - stored.normal_consistency));
+        losses.at_most("arc length deviation", self.arc_length_deviation, limit(stored.arc_length_deviation) + 1e-5);
+        losses.at_most("evaluations", self.evaluations_per_vertex, limit(stored.evaluations_per_vertex));
         if (self.vertices, self.corners) != (stored.vertices, stored.corners) {
-            losses.push(format!("{} vertices and {} corners", self.vertices, self.corners));
+            losses.0.push(format!("{} vertices and {} corners", self.vertices, self.corners));
         }
-        losses
+        losses.0
     }
 }
 

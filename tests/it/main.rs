@@ -9,6 +9,8 @@ mod control;
 mod curves;
 mod evaluate;
 mod faults;
+mod losses;
 mod metrics;
 mod refusals;
+mod relaxed;
 mod walk;

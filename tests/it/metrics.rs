@@ -11,6 +11,7 @@
 
 use crate::app::BINARY;
 use crate::cli::scenes;
+use crate::losses::{Losses, count, number};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use shrinkd::field::input::{Description, describe};
@@ -48,47 +49,37 @@ struct Metrics {
 
 impl Metrics {
     fn of(report: &Value) -> Self {
-        let number =
-            |pointer: &str| report.pointer(pointer).and_then(Value::as_f64).unwrap_or_else(|| panic!("no {pointer}"));
-        let count =
-            |pointer: &str| report.pointer(pointer).and_then(Value::as_u64).unwrap_or_else(|| panic!("no {pointer}"));
         Self {
-            vertices: count("/vertices"),
-            flips: count("/flips/surface") + count("/flips/sphere") + count("/flips/uv"),
-            self_intersections: count("/self_intersections"),
-            distance_mean: number("/distance/mean"),
-            distance_max: number("/distance/max"),
-            normal_consistency: number("/normal_consistency"),
-            sphere_qc: number("/distortion/sphere/qc"),
-            sphere_symmetric_dirichlet: number("/distortion/sphere/symmetric_dirichlet"),
-            sphere_log_area_rms: number("/distortion/sphere/log_area_rms"),
-            evaluations_per_vertex: number("/evaluations/per_vertex"),
+            vertices: count(report, "/vertices"),
+            flips: count(report, "/flips/surface") + count(report, "/flips/sphere") + count(report, "/flips/uv"),
+            self_intersections: count(report, "/self_intersections"),
+            distance_mean: number(report, "/distance/mean"),
+            distance_max: number(report, "/distance/max"),
+            normal_consistency: number(report, "/normal_consistency"),
+            sphere_qc: number(report, "/distortion/sphere/qc"),
+            sphere_symmetric_dirichlet: number(report, "/distortion/sphere/symmetric_dirichlet"),
+            sphere_log_area_rms: number(report, "/distortion/sphere/log_area_rms"),
+            evaluations_per_vertex: number(report, "/evaluations/per_vertex"),
         }
     }
 
     /// What got worse.
     fn losses(&self, stored: &Metrics) -> Vec<String> {
-        let mut losses = Vec::new();
-        let mut at_most = |what: &str, found: f64, limit: f64| {
-            // written so that NaN is a loss
-            if !matches!(found.partial_cmp(&limit), Some(std::cmp::Ordering::Less | std::cmp::Ordering::Equal)) {
-                losses.push(format!("{what} is {found}, over {limit}"));
-            }
-        };
-        at_most("flips", self.flips as f64, stored.flips as f64);
-        at_most("self-intersections", self.self_intersections as f64, stored.self_intersections as f64);
-        at_most("mean distance", self.distance_mean, stored.distance_mean * (1.0 + DISTANCE));
-        at_most("largest distance", self.distance_max, stored.distance_max * (1.0 + DISTANCE));
-        at_most("1 - NC", 1.0 - self.normal_consistency, 1.0 - stored.normal_consistency + NORMAL_CONSISTENCY);
-        at_most("QC", self.sphere_qc, stored.sphere_qc * (1.0 + DISTORTION));
+        let mut losses = Losses::default();
+        losses.at_most("flips", self.flips as f64, stored.flips as f64);
+        losses.at_most("self-intersections", self.self_intersections as f64, stored.self_intersections as f64);
+        losses.at_most("mean distance", self.distance_mean, stored.distance_mean * (1.0 + DISTANCE));
+        losses.at_most("largest distance", self.distance_max, stored.distance_max * (1.0 + DISTANCE));
+        losses.at_most("1 - NC", 1.0 - self.normal_consistency, 1.0 - stored.normal_consistency + NORMAL_CONSISTENCY);
+        losses.at_most("QC", self.sphere_qc, stored.sphere_qc * (1.0 + DISTORTION));
         let (found, stored_energy) = (self.sphere_symmetric_dirichlet, stored.sphere_symmetric_dirichlet);
-        at_most("symmetric Dirichlet", found, stored_energy * (1.0 + DISTORTION));
-        at_most("log area RMS", self.sphere_log_area_rms, stored.sphere_log_area_rms * (1.0 + DISTORTION));
-        at_most("evaluations", self.evaluations_per_vertex, stored.evaluations_per_vertex * (1.0 + EVALUATIONS));
+        losses.at_most("symmetric Dirichlet", found, stored_energy * (1.0 + DISTORTION));
+        losses.at_most("log area RMS", self.sphere_log_area_rms, stored.sphere_log_area_rms * (1.0 + DISTORTION));
+        losses.at_most("evaluations", self.evaluations_per_vertex, stored.evaluations_per_vertex * (1.0 + EVALUATIONS));
         if self.vertices != stored.vertices {
-            losses.push(format!("there are {} vertices instead of {}", self.vertices, stored.vertices));
+            losses.0.push(format!("there are {} vertices instead of {}", self.vertices, stored.vertices));
         }
-        losses
+        losses.0
     }
 }
 

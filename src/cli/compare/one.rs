@@ -10,7 +10,7 @@ use crate::field::Sampler;
 use crate::field::input::{Description, FieldOptions};
 use crate::field::sampler::Tally;
 use crate::job::failure::{self, Failure};
-use crate::job::pipeline::{self, Made, Opened};
+use crate::job::pipeline::{self, Asked, Made, Opened};
 use crate::job::spec::{FieldSpec, OutputName};
 use crate::measure::baseline::{Baseline, baseline, side_for};
 use crate::measure::report::passes;
@@ -141,9 +141,10 @@ fn wrapped(
     let progress = |progress: Progress| watch.pause(matches!(progress.stage, "measure" | "write"));
     watch.reset();
     watch.pause(false);
+    let asked = Asked { shrink: &spec, budget: Budget::default(), outputs, load_seconds: load };
     let made = guarded(task, &|cancel| {
         let settings = Settings { pool: task.pool, cancel, progress: &progress };
-        pipeline::make(opened, &spec, Budget::default(), outputs, load, settings)
+        pipeline::make(opened, &asked, settings)
     });
     watch.pause(true);
     let seconds = load + clock.elapsed().as_secs_f64();

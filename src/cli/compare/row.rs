@@ -96,7 +96,7 @@ impl Row {
     }
 
     fn figures(&self, report: &Report, line: &mut String) {
-        let (flips, sphere, d) = (report.flips, &report.distortion.sphere, &report.distance);
+        let (flips, sphere, d) = (report.flips, &report.distortion.sphere, &report.closeness.distance);
         let base = self.baseline.as_ref();
         let or_none = |text: Option<String>| text.unwrap_or_else(|| "–".to_owned());
         let cells = [
@@ -108,9 +108,9 @@ impl Row {
             format!("{:.3}", 100.0 * d.surface_to_truth.max),
             format!("{:.3}", 100.0 * d.truth_to_surface.max),
             format!("{:.2}", 1e4 * d.mean),
-            or_none(base.map(|b| format!("{:.2}", 1e4 * b.distance.mean))),
-            format!("{:.4}", report.normal_consistency),
-            or_none(base.map(|b| format!("{:.4}", b.normal_consistency))),
+            or_none(base.map(|b| format!("{:.2}", 1e4 * b.closeness.distance.mean))),
+            format!("{:.4}", report.closeness.normal_consistency),
+            or_none(base.map(|b| format!("{:.4}", b.closeness.normal_consistency))),
             format!("{:.2}", sphere.area_p1),
             format!("{:.2}", sphere.area_p99),
             format!("{:.2}", sphere.log_area_rms),

@@ -28,9 +28,9 @@ pub fn tile(row: &Row, pixels: Vec<u8>) -> Tile {
     let figures = row.report.as_ref().map(|report| {
         format!(
             "max {:.2}% mean {:.2}e-4 NC {:.4} area {:.2}-{:.2}",
-            100.0 * report.distance.max,
-            1e4 * report.distance.mean,
-            report.normal_consistency,
+            100.0 * report.closeness.distance.max,
+            1e4 * report.closeness.distance.mean,
+            report.closeness.normal_consistency,
             report.distortion.sphere.area_p1,
             report.distortion.sphere.area_p99
         )

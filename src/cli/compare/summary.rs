@@ -105,8 +105,12 @@ fn group<'a>(folder: &str, lattice: LatticeSpec, rows: impl Iterator<Item = &'a 
         refused_unexpectedly,
         share: (counted > 0).then(|| passed as f64 / counted as f64),
         beside_baseline: count(&|row| both(row).is_some()),
-        normals_as_good: count(&|row| both(row).is_some_and(|(r, b)| r.normal_consistency >= b.normal_consistency)),
-        mean_as_good: count(&|row| both(row).is_some_and(|(r, b)| r.distance.mean <= b.distance.mean)),
+        normals_as_good: count(&|row| {
+            both(row).is_some_and(|(r, b)| r.closeness.normal_consistency >= b.closeness.normal_consistency)
+        }),
+        mean_as_good: count(&|row| {
+            both(row).is_some_and(|(r, b)| r.closeness.distance.mean <= b.closeness.distance.mean)
+        }),
         measured: count(&|row| row.report.is_some()),
         area_in_bounds: count(&|row| {
             let sphere = row.report.as_ref().map(|r| r.distortion.sphere);
@@ -114,10 +118,10 @@ fn group<'a>(folder: &str, lattice: LatticeSpec, rows: impl Iterator<Item = &'a 
         }),
         medians: Medians {
             evaluations_per_vertex: reported(&|r| r.evaluations.per_vertex),
-            max_distance: reported(&|r| r.distance.max),
-            mean_distance: reported(&|r| r.distance.mean),
-            normal_consistency: reported(&|r| r.normal_consistency),
-            baseline_normal_consistency: median(&|row| row.baseline.map(|b| b.normal_consistency)),
+            max_distance: reported(&|r| r.closeness.distance.max),
+            mean_distance: reported(&|r| r.closeness.distance.mean),
+            normal_consistency: reported(&|r| r.closeness.normal_consistency),
+            baseline_normal_consistency: median(&|row| row.baseline.map(|b| b.closeness.normal_consistency)),
             log_area_rms: reported(&|r| r.distortion.sphere.log_area_rms),
             symmetric_dirichlet: reported(&|r| r.distortion.sphere.symmetric_dirichlet),
             shrink_seconds: reported(&|r| r.seconds.shrink),

@@ -41,7 +41,7 @@ pub fn to_text(found: &Evaluation, mesh: &Path, truth: &Path, kind: &str) -> Str
         text.push_str(&laid_out(&rows));
         let _ = writeln!(text, "\ncharts: {}", chart.charts);
     }
-    let (distance, [there, back]) = (&found.surface.distance, found.surface.worst_places);
+    let (distance, [there, back]) = (&found.surface.closeness.distance, found.surface.worst_places);
     let place = |[x, y, z]: [f64; 3]| format!("({x:.5}, {y:.5}, {z:.5})");
     let _ = writeln!(
         text,
@@ -94,19 +94,19 @@ fn figures(found: &Evaluation) -> Vec<Vec<String>> {
     row("flips on the surface", &|f| f.flips.to_string());
     row("triangles without area", &|f| f.degenerate.to_string());
     row("self-intersections", &|f| f.self_intersections.to_string());
-    row("to truth: mean", &|f| small(f.distance.surface_to_truth.mean));
-    row("to truth: RMS", &|f| small(f.distance.surface_to_truth.rms));
-    row("to truth: max", &|f| small(f.distance.surface_to_truth.max));
-    row("from truth: mean", &|f| small(f.distance.truth_to_surface.mean));
-    row("from truth: RMS", &|f| small(f.distance.truth_to_surface.rms));
-    row("from truth: max", &|f| small(f.distance.truth_to_surface.max));
-    row("both: mean", &|f| small(f.distance.mean));
-    row("both: max", &|f| small(f.distance.max));
+    row("to truth: mean", &|f| small(f.closeness.distance.surface_to_truth.mean));
+    row("to truth: RMS", &|f| small(f.closeness.distance.surface_to_truth.rms));
+    row("to truth: max", &|f| small(f.closeness.distance.surface_to_truth.max));
+    row("from truth: mean", &|f| small(f.closeness.distance.truth_to_surface.mean));
+    row("from truth: RMS", &|f| small(f.closeness.distance.truth_to_surface.rms));
+    row("from truth: max", &|f| small(f.closeness.distance.truth_to_surface.max));
+    row("both: mean", &|f| small(f.closeness.distance.mean));
+    row("both: max", &|f| small(f.closeness.distance.max));
     row("field: mean", &|f| small(f.values.mean));
     row("field: RMS", &|f| small(f.values.rms));
     row("field: max", &|f| small(f.values.max));
-    row("NC", &|f| format!("{:.4}", f.normal_consistency));
-    row("NC, signed", &|f| format!("{:.4}", f.normal_consistency_signed));
+    row("NC", &|f| format!("{:.4}", f.closeness.normal_consistency));
+    row("NC, signed", &|f| format!("{:.4}", f.closeness.normal_consistency_signed));
     let sampled = |figure: fn(&Chamfer) -> Option<f64>, factor: f64, digits: usize| {
         move |f: &Figures| {
             f.chamfer.as_ref().and_then(figure).map_or(NONE.to_owned(), |v| format!("{:.digits$}", factor * v))

@@ -80,6 +80,8 @@ struct Attributes {
     position: Option<usize>,
     #[serde(rename = "TEXCOORD_0")]
     place: Option<usize>,
+    #[serde(rename = "TEXCOORD_1")]
+    second_place: Option<usize>,
 }
 
 #[derive(Deserialize)]
@@ -114,10 +116,10 @@ pub(super) fn read(bytes: &[u8]) -> Result<Soup, FieldError> {
     collect(bytes, Soup::new(FORMAT)).map(|(soup, _)| soup)
 }
 
-/// The same with a place in the chart for every vertex, and the document's `extras`. The places are gone from the soup when
-/// a primitive has none.
+/// The same with the places in the first two charts of every vertex, and the document's `extras`. The places of a chart are gone
+/// from the soup when a primitive has none there.
 pub(super) fn read_charted(bytes: &[u8]) -> Result<(Soup, serde_json::Value), FieldError> {
-    collect(bytes, Soup { places: Some(Vec::new()), ..Soup::new(FORMAT) })
+    collect(bytes, Soup { places: [Some(Vec::new()), Some(Vec::new())], ..Soup::new(FORMAT) })
 }
 
 fn collect(bytes: &[u8], mut soup: Soup) -> Result<(Soup, serde_json::Value), FieldError> {
@@ -228,21 +230,19 @@ fn add_mesh(
             soup.vertex(placed.to_array(), at)?;
         }
         let count = positions.count;
-        if let Some(mut places) = soup.places.take() {
-            soup.places = match primitive.attributes.place {
-                None => None,
-                Some(place) => {
-                    let elements = Elements::of(document, place, binary, "VEC2")?;
-                    if elements.count != count {
-                        let found = elements.count;
-                        return Err(fault(format!("{count} positions have {found} texture coordinates")));
-                    }
-                    for i in 0..count {
-                        places.push(elements.pair(i)?);
-                    }
-                    Some(places)
-                }
+        let charts = [primitive.attributes.place, primitive.attributes.second_place];
+        for (known, chart) in soup.places.iter_mut().zip(charts) {
+            let (Some(places), Some(chart)) = (known.as_mut(), chart) else {
+                *known = None;
+                continue;
             };
+            let elements = Elements::of(document, chart, binary, "VEC2")?;
+            if elements.count != count {
+                return Err(fault(format!("{count} positions have {} texture coordinates", elements.count)));
+            }
+            for i in 0..count {
+                places.push(elements.pair(i)?);
+            }
         }
         let indices = primitive.indices.map(|index| Elements::of(document, index, binary, "SCALAR")).transpose()?;
         let corners = indices.as_ref().map_or(count, |e| e.count);

@@ -1,7 +1,6 @@
 //! Jobs of dimension 2: from a field to a certified curve and its outputs.
 
-use super::{MEASURED_SHARE, Opened, lasting, pretty};
-use crate::extract::Budget;
+use super::{Asked, MEASURED_SHARE, Opened, lasting, pretty};
 use crate::field::Sampler;
 use crate::field::sampler::Tally;
 use crate::job::failure::{Ended, Failure};
@@ -10,7 +9,7 @@ use crate::measure::curve::{CurveReport, measure};
 use crate::measure::report::Evaluations;
 use crate::settings::{Progress, Settings};
 use crate::shrink::curve::{Curve, CurveSpec, shrink_curve};
-use crate::shrink::{Effort, Method, ShrinkError, ShrinkSpec};
+use crate::shrink::{Effort, Method, ShrinkError};
 use crate::surface;
 use std::time::Instant;
 
@@ -46,19 +45,16 @@ impl CurveMade {
 
 /// How bad a curve is: first by the number of its faults, then by its distance.
 fn rank(report: &CurveReport) -> (u64, f64) {
-    (report.flips.surface + report.flips.uv + report.self_intersections + report.degenerate, report.distance.max)
+    (
+        report.flips.surface + report.flips.uv + report.self_intersections + report.degenerate,
+        report.closeness.distance.max,
+    )
 }
 
 /// Makes a certified curve of a field of dimension 2, or the best there is, and writes it. Tried again with more effort
 /// where it does not pass; a refusal for its topology is believed when a closer look finds the same.
-pub fn make_curve(
-    opened: &Opened,
-    spec: &ShrinkSpec,
-    budget: Budget,
-    outputs: &[OutputName],
-    load_seconds: f64,
-    settings: Settings<'_>,
-) -> Result<CurveMade, Ended> {
+pub fn make_curve(opened: &Opened, asked: &Asked<'_>, settings: Settings<'_>) -> Result<CurveMade, Ended> {
+    let Asked { shrink: spec, budget, load_seconds, .. } = *asked;
     let tally = Tally::new();
     let spent = || tally.total().total();
     let (mut best, mut refusal): (Option<(Curve, CurveReport)>, Option<ShrinkError>) = (None, None);
@@ -83,7 +79,7 @@ pub fn make_curve(
             Ok(curve) => curve,
             // what is joined by something thin may look apart at first
             Err(
-                error @ (ShrinkError::Components { .. } | ShrinkError::NoComponent { .. } | ShrinkError::Genus { .. }),
+                error @ (ShrinkError::Components { .. } | ShrinkError::NoComponent { .. } | ShrinkError::Holes { .. }),
             ) => {
                 let again = refusal.as_ref().is_some_and(|before| before.to_string() == error.to_string());
                 refusal = Some(error);
@@ -123,11 +119,10 @@ pub fn make_curve(
         ..Progress::default()
     });
     let clock = Instant::now();
-    let mut files = Vec::new();
-    for &output in outputs {
-        settings.cancel.check()?;
-        let bytes = match output {
-            OutputName::Glb => surface::curve::to_glb(&curve, &lasting(&report), &opened.provenance),
+    let lasting = lasting(&report);
+    let files = asked.written(&settings, |output| {
+        Ok(match output {
+            OutputName::Glb => surface::curve::to_glb(&curve, &lasting, &opened.provenance),
             OutputName::Surface => surface::curve::to_safetensors(&curve),
             OutputName::Svg => surface::curve::to_svg(&curve).into_bytes(),
             OutputName::Preview => surface::curve::to_png(&curve, PICTURE, &settings)?,
@@ -135,8 +130,7 @@ pub fn make_curve(
                 report.seconds.write = clock.elapsed().as_secs_f64();
                 pretty(&report)
             }
-        };
-        files.push((output, bytes));
-    }
+        })
+    })?;
     Ok(CurveMade { report, files })
 }

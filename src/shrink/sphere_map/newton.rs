@@ -152,7 +152,7 @@ impl System {
             }
             // the sphere's own curvature, where it does not bend the energy downwards
             diagonal += DMat2::from_diagonal(DVec2::splat(f64::max(inward, 0.0)));
-            let inverse = inverse_positive(diagonal.x_axis.x, diagonal.y_axis.x, diagonal.y_axis.y);
+            let inverse = inverse_positive(diagonal);
             out.push(Node { gradient, inverse, diagonal: diagonal.as_mat2() });
         });
         let edges = level.map_rows(settings, |v, out: &mut Vec<Mat2>| {
@@ -341,7 +341,7 @@ impl Triangle {
 /// The Hessian of the energy as a function of a planar Jacobian, times `area`, its negative eigenvalues left out: four
 /// matrices whose squares sum to it (Smith, de Goes and Kim 2019, "Analytic eigensystems for isotropic distortion
 /// energies", in the plane).
-fn positive_modes(jacobian: DMat2, area: f64, objective: &Objective) -> [DMat2; 4] {
+pub fn positive_modes(jacobian: DMat2, area: f64, objective: &Objective) -> [DMat2; 4] {
     /// No direction is taken for flatter than this share of the Dirichlet term's own curvature.
     const FLAT: f64 = 0.02;
     let [[a, c], [b, d]] = jacobian.to_cols_array_2d();

@@ -13,9 +13,9 @@
 //! polygon, scene units). The same curve gives the same bytes.
 
 use crate::shrink::curve::Curve;
-use safetensors::tensor::{Dtype, TensorView};
+use crate::surface::tensors::{Tensor, file};
+use safetensors::tensor::Dtype;
 use serde_json::json;
-use std::collections::HashMap;
 
 /// Version of the layout above.
 const FORMAT: u32 = 1;
@@ -50,7 +50,7 @@ pub fn curvatures(curve: &Curve) -> Vec<f64> {
 pub fn to_safetensors(curve: &Curve) -> Vec<u8> {
     let n = curve.positions.len();
     let flat = |values: &[f64]| -> Vec<u8> { values.iter().flat_map(|&x| (x as f32).to_le_bytes()).collect() };
-    let tensors: Vec<(&str, Dtype, Vec<usize>, Vec<u8>)> = vec![
+    let tensors: Vec<Tensor> = vec![
         ("positions", Dtype::F32, vec![n, 2], flat(curve.positions.as_flattened())),
         ("normals", Dtype::F32, vec![n, 2], flat(curve.normals.as_flattened())),
         ("u", Dtype::F32, vec![n], flat(&curve.parameters)),
@@ -66,12 +66,7 @@ pub fn to_safetensors(curve: &Curve) -> Vec<u8> {
         "vertices": n,
         "length": (0..n).map(|i| step(curve, i)).sum::<f64>(),
     });
-    // one entry: the order of several would change from run to run
-    let metadata = HashMap::from([("shrinkd".to_owned(), about.to_string())]);
-    let views = tensors.iter().map(|(name, dtype, shape, data)| {
-        (*name, TensorView::new(*dtype, shape.clone(), data).expect("as many bytes as the shape says"))
-    });
-    safetensors::serialize(views, Some(metadata)).expect("a header far under the format's limit")
+    file(&tensors, &about)
 }
 
 #[cfg(test)]
