@@ -4,7 +4,7 @@
 use super::contract::Front;
 use super::remesh::remesh;
 use super::rings::Mesh;
-use super::tips::{Plane, reach_tips};
+use super::tips::{Plane, part, reach_tips};
 use super::zero::own_sheet;
 use crate::field::Sampler;
 use crate::settings::Canceled;
@@ -26,6 +26,8 @@ const ROUNDS: [Round; 2] = [
     Round { remeshings: 2, turn: -0.2, guard: -0.5, loss: 0.2 },
     Round { remeshings: 1, turn: 0.3, guard: 0.0, loss: 0.1 },
 ];
+/// Cosine of the largest angle that a triangle may turn by when a vertex goes to a tip.
+const TIP_TURN: f64 = 0.0;
 /// Share of the way to the middle of its star that a vertex slides at once.
 const SMOOTHING: f64 = 0.6;
 
@@ -45,8 +47,9 @@ fn even(mut mesh: Mesh, vertices: usize, sampler: &Sampler<'_>) -> Result<Mesh, 
             remesh(&mut mesh, target, SMOOTHING, round.turn, round.loss, cancel)?;
         }
         let planes = onto_zero(&mut mesh, sampler, target, round.guard)?;
-        reach_tips(&mut mesh, &planes, target, round.guard, sampler)?;
+        reach_tips(&mut mesh, &planes, target, TIP_TURN, sampler)?;
     }
+    part(&mut mesh, cancel)?;
     Ok(mesh)
 }
 

@@ -5,7 +5,7 @@
 //! On a sharp feature the field is zero there; before a rounded one the place lies beyond the surface, in line with the
 //! tip, and from there the gradient leads to the tip itself.
 
-use super::collide::{Bounds, Index, meet};
+use super::collide::{Index, meet};
 use super::creases::least_squares;
 use super::energy::add_outer;
 use super::rings::Mesh;
@@ -13,7 +13,7 @@ use super::unfold::Corners;
 use super::zero::step_to_zero;
 use crate::field::mesh::closest_on_triangle;
 use crate::field::{Metric, Sampler};
-use crate::settings::Canceled;
+use crate::settings::{CancelToken, Canceled};
 use glam::{DMat3, DVec3};
 
 /// A vertex moves only to a place that its triangles miss by this many edges; nearer ones are curvature, not features.
@@ -79,6 +79,38 @@ pub fn reach_tips(
     Ok(())
 }
 
+/// Takes triangles that cross apart where moving a vertex towards the middle of its neighbours does it.
+pub fn part(mesh: &mut Mesh, cancel: &CancelToken) -> Result<(), Canceled> {
+    /// Rounds over the vertices that are left with crossings.
+    const SWEEPS: usize = 4;
+    /// Shares of the way that are tried.
+    const STEPS: [f64; 3] = [0.3, 0.6, 1.0];
+    let triangles = mesh.rings.triangles();
+    let corners = Corners::new(mesh.positions.len(), &triangles);
+    let mut apart = Apart::new(&mesh.positions, &triangles, &corners);
+    let mut crossed: Vec<u32> = (0..triangles.len() as u32)
+        .filter(|&t| apart.crosses(&mesh.positions, t))
+        .flat_map(|t| triangles[t as usize])
+        .collect();
+    for _ in 0..SWEEPS {
+        cancel.check()?;
+        crossed.sort_unstable();
+        crossed.dedup();
+        crossed.retain(|&v| apart.crossings_at(&mesh.positions, v) > 0);
+        for &v in &crossed {
+            let ring = mesh.rings.ring(v);
+            let middle = ring.iter().map(|&u| mesh.positions[u as usize]).sum::<DVec3>() / ring.len() as f64;
+            let from = mesh.positions[v as usize];
+            for step in STEPS {
+                if apart.try_part(&mut mesh.positions, v, from.lerp(middle, step)) {
+                    break;
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
 /// Lets vertices of a surface move only where no triangle then crosses one that it did not cross before.
 pub(super) struct Apart<'a> {
     triangles: &'a [[u32; 3]],
@@ -104,6 +136,22 @@ impl<'a> Apart<'a> {
         true
     }
 
+    /// Moves `v` to `to`, if the triangles there then cross fewer others. Returns whether it moved.
+    pub fn try_part(&mut self, positions: &mut [DVec3], v: u32, to: DVec3) -> bool {
+        let (before, from) = (self.crossings_at(positions, v), positions[v as usize]);
+        self.put_back(positions, v, to);
+        let parted = self.crossings_at(positions, v) < before;
+        if !parted {
+            self.put_back(positions, v, from);
+        }
+        parted
+    }
+
+    /// Whether a triangle crosses another.
+    fn crosses(&self, positions: &[DVec3], t: u32) -> bool {
+        self.crossings_of(positions, t) > 0
+    }
+
     /// Moves `v` to `to`, whatever is there.
     pub fn put_back(&mut self, positions: &mut [DVec3], v: u32, to: DVec3) {
         positions[v as usize] = to;
@@ -117,15 +165,14 @@ impl<'a> Apart<'a> {
     }
 
     fn crossings_at(&self, positions: &[DVec3], v: u32) -> usize {
-        let mut count = 0;
-        for &k in self.corners.at(v) {
-            let t = k / 3;
-            let corners = self.triangles[t as usize];
-            self.index.near(&Bounds::around(corners.map(|u| positions[u as usize])), |other| {
-                let crosses = other != t && meet(positions, corners, self.triangles[other as usize]);
-                count += usize::from(crosses);
-            });
-        }
+        self.corners.at(v).iter().map(|&k| self.crossings_of(positions, k / 3)).sum()
+    }
+
+    fn crossings_of(&self, positions: &[DVec3], t: u32) -> usize {
+        let (corners, mut count) = (self.triangles[t as usize], 0);
+        self.index.near(self.index.bounds(t), |other| {
+            count += usize::from(other != t && meet(positions, corners, self.triangles[other as usize]));
+        });
         count
     }
 }
