@@ -25,6 +25,7 @@ pub use sheet::Sheet;
 pub use topology::Soundness;
 
 use super::FieldError;
+use glam::DVec3;
 use std::collections::HashMap;
 
 /// Most triangles that are read: at about 400 bytes per triangle of search structure this is 1.6 GiB.
@@ -58,6 +59,11 @@ pub struct ChartedMesh {
     pub triangles: Vec<[u32; 3]>,
     /// The `extras` of the document; null when there are none.
     pub extras: serde_json::Value,
+}
+
+/// The point of a triangle nearest to `p`.
+pub(crate) fn closest_on_triangle(p: DVec3, [a, b, c]: [DVec3; 3]) -> DVec3 {
+    closest::closest(p, a, b - a, c - a).0
 }
 
 impl ChartedMesh {

@@ -5,6 +5,7 @@ use super::contract::{Refusal, Resolution, contract};
 use super::creases::{choose_diagonals, snap};
 use super::density::density;
 use super::lattice::SphereLattice;
+use super::reclaim::{Base, reclaim};
 use super::resample::{land, orient};
 use super::separate::separate;
 use super::sphere_map::sphere_map;
@@ -103,7 +104,8 @@ fn one(
     let folds = tangle.relax_patches(&mut at, &landed, 2)?;
     stage("sharpen", 0.95, Some(show(&at.positions, triangles)), None, Some(folds as u64));
     let blunt = at.positions.clone();
-    let diagonals = sharpen(&sampler, lattice, &mut at, diagonals)?;
+    let base = Base { mesh: &mesh, directions: &directions };
+    let diagonals = sharpen(&sampler, &base, lattice, &mut at, diagonals)?;
     let triangles = lattice.triangles(&diagonals);
     stage("separate", 0.97, Some(show(&at.positions, triangles)), None, Some(folds as u64));
     let to_scene = |list: &[DVec3]| -> Vec<DVec3> { list.iter().map(|&p| frame.to_scene(p)).collect() };
@@ -119,16 +121,20 @@ fn one(
     Ok(wrap)
 }
 
-/// Moves vertices onto creases and turns diagonals along them. What that folds or lets cross is repaired later.
+/// Moves vertices onto creases and to what the base has and the lattice misses, and turns diagonals along them. What that
+/// folds or lets cross is repaired later.
 fn sharpen(
     sampler: &Sampler<'_>,
+    base: &Base<'_>,
     lattice: &SphereLattice,
     at: &mut OnZero,
     mut diagonals: Vec<bool>,
 ) -> Result<Vec<bool>, ShrinkError> {
     let triangles = lattice.triangles(&diagonals);
     let corners = Corners::new(at.positions.len(), &triangles);
-    let moved = snap(sampler, &triangles, &corners, at)?;
+    let mut moved = snap(sampler, &triangles, &corners, at)?;
+    let edge = (base.mesh.area() / lattice.directions.len() as f64).sqrt();
+    moved.extend(reclaim(sampler, base, lattice, &triangles, &corners, at, edge)?);
     let mut mask = vec![false; at.positions.len()];
     for v in moved {
         mask[v as usize] = true;

@@ -110,7 +110,7 @@ fn candidates(triangles: &[[u32; 3]], corners: &Corners, positions: &[DVec3], no
 }
 
 /// The shortest solution of a symmetric system, small eigenvalues left out, and its rank.
-fn least_squares(matrix: DMat3, right: DVec3) -> (DVec3, usize) {
+pub(super) fn least_squares(matrix: DMat3, right: DVec3) -> (DVec3, usize) {
     /// Eigenvalues below this share of the largest say nothing.
     const SMALL: f64 = 0.04;
     let (values, vectors) = symmetric_eigen(matrix);
@@ -150,7 +150,7 @@ fn symmetric_eigen(matrix: DMat3) -> (DVec3, DMat3) {
 }
 
 /// Whether every triangle around `v` stays a decent triangle that agrees with its corners' normals when `v` goes to `to`.
-fn keeps_shape(
+pub(super) fn keeps_shape(
     triangles: &[[u32; 3]],
     corners: &Corners,
     positions: &[DVec3],

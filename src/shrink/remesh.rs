@@ -11,15 +11,20 @@ use glam::{DMat3, DVec3};
 const LONG: f64 = 4.0 / 3.0;
 /// Edges shorter than this many target lengths are collapsed.
 const SHORT: f64 = 0.8;
-/// A collapse may move the surface by this many target lengths.
-const LOSS: f64 = 0.2;
 
 /// One round of split, collapse, flip and, where `smooth` > 0, tangential smoothing with that step. `turn` is the cosine
-/// of the largest angle that a triangle may turn by.
-pub fn remesh(mesh: &mut Mesh, target: f64, smooth: f64, turn: f64, cancel: &CancelToken) -> Result<(), Canceled> {
+/// of the largest angle that a triangle may turn by; a collapse may move the surface by `loss` target lengths.
+pub fn remesh(
+    mesh: &mut Mesh,
+    target: f64,
+    smooth: f64,
+    turn: f64,
+    loss: f64,
+    cancel: &CancelToken,
+) -> Result<(), Canceled> {
     split(mesh, target);
     cancel.check()?;
-    collapse(mesh, target, turn, cancel)?;
+    collapse(mesh, target, turn, loss, cancel)?;
     cancel.check()?;
     flip(mesh, target);
     cancel.check()?;
@@ -58,7 +63,7 @@ fn split(mesh: &mut Mesh, target: f64) {
     }
 }
 
-fn collapse(mesh: &mut Mesh, target: f64, turn: f64, cancel: &CancelToken) -> Result<(), Canceled> {
+fn collapse(mesh: &mut Mesh, target: f64, turn: f64, loss: f64, cancel: &CancelToken) -> Result<(), Canceled> {
     /// A closed mesh keeps at least this many vertices.
     const FEWEST: usize = 8;
     let mut short = edges(mesh, |length| length < SHORT * target);
@@ -77,7 +82,7 @@ fn collapse(mesh: &mut Mesh, target: f64, turn: f64, cancel: &CancelToken) -> Re
         }
         let (pa, pb) = (mesh.positions[a as usize], mesh.positions[b as usize]);
         for (to, v, w) in [(0.5 * (pa + pb), a, b), (pb, a, b), (pa, b, a)] {
-            if off_planes(mesh, v, w, to).max(off_planes(mesh, w, v, to)) > LOSS * target {
+            if off_planes(mesh, v, w, to).max(off_planes(mesh, w, v, to)) > loss * target {
                 continue;
             }
             if !mesh.may_move(v, to, Some(w), turn) || !mesh.may_move(w, to, Some(v), turn) {

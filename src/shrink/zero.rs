@@ -1,5 +1,6 @@
 //! Steps onto the zero level set that can be trusted on fields that are not distances.
 
+use super::tips::Plane;
 use crate::field::{Metric, Sampler};
 use crate::settings::Canceled;
 use glam::DVec3;
@@ -17,22 +18,25 @@ pub fn step_to_zero(value: f64, gradient: DVec3, reach: f64) -> DVec3 {
 /// thin wall.
 const OWN: f64 = 0.1;
 
-/// Where points with the outward normals of a surface go on the zero level set: the Newton step, or, where the gradient
-/// belongs to another sheet, along the normal to the sheet of their own.
+/// Where points with the outward normals of a surface go on the zero level set, and its tangent planes there: the Newton
+/// step, or, where the gradient belongs to another sheet, along the normal to the sheet of their own, without a plane.
 pub fn own_sheet(
     sampler: &Sampler<'_>,
     points: &[DVec3],
     normals: &[DVec3],
     reach: f64,
-) -> Result<Vec<DVec3>, Canceled> {
+) -> Result<Vec<Plane>, Canceled> {
     let (values, gradients) = sampler.gradients(points)?;
-    let mut targets: Vec<DVec3> =
-        (0..points.len()).map(|i| points[i] + step_to_zero(values[i], gradients[i], reach)).collect();
+    let plane = |i: usize| Plane {
+        point: points[i] + step_to_zero(values[i], gradients[i], reach),
+        normal: gradients[i].normalize_or_zero(),
+    };
+    let mut planes: Vec<Plane> = (0..points.len()).map(plane).collect();
     let strayed: Vec<usize> = (0..points.len()).filter(|&i| is_stray(gradients[i], normals[i])).collect();
     for (&i, found) in strayed.iter().zip(along_normals(sampler, points, normals, &strayed, reach)?) {
-        targets[i] = found.unwrap_or(points[i]);
+        planes[i] = Plane { point: found.unwrap_or(points[i]), normal: DVec3::ZERO };
     }
-    Ok(targets)
+    Ok(planes)
 }
 
 fn is_stray(gradient: DVec3, normal: DVec3) -> bool {
