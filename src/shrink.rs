@@ -12,6 +12,7 @@ mod complex;
 mod contract;
 mod creases;
 pub mod curve;
+mod denser;
 mod density;
 mod energy;
 mod graded;

@@ -3,18 +3,20 @@
 use super::base::base;
 use super::contract::{Refusal, Resolution, contract};
 use super::creases::{choose_diagonals, snap};
+use super::denser::denser;
 use super::density::density;
 use super::lattice::SphereLattice;
-use super::reclaim::{Base, reclaim};
+use super::reclaim::{Base, missed, reclaim};
 use super::resample::{land, orient};
 use super::separate::separate;
-use super::sphere_map::sphere_map;
+use super::rings::Mesh;
+use super::sphere_map::{SphereMap, again, sphere_map};
 use super::unfold::Corners;
 use super::untangle::Tangle;
 use super::zero::{OnZero, project};
 use super::{Effort, ShrinkError, ShrinkSpec, Wrap};
 use crate::field::Sampler;
-use crate::settings::{Front, Progress};
+use crate::settings::{Canceled, Front, Progress, Settings};
 use glam::DVec3;
 
 /// What one attempt works with.
@@ -31,6 +33,9 @@ const ATTEMPTS: [Attempt; 3] = [
     Attempt { resolution: Resolution { levels: 3, probe: true, local: 2 }, fineness: 2.0, share: (0.7, 0.9) },
     Attempt { resolution: Resolution { levels: 4, probe: false, local: 1 }, fineness: 2.0, share: (0.9, 1.0) },
 ];
+
+/// Rounds of asking for more of the sphere where the lattice misses the base.
+const DENSER: usize = 3;
 
 /// Vertices of the base surface that a lattice is sampled from: half as many as the default lattice has, and more slowly
 /// growing than the lattice, because what is finer than the base the field itself says.
@@ -89,11 +94,22 @@ fn one(
     let sampler = scene.framed(frame);
     let mesh = base(front, (attempt.fineness * base_vertices(lattice)) as usize, &sampler)?;
     stage("map", 0.45, Some(show(&mesh.positions, mesh.rings.triangles())), None, None);
-    let map = sphere_map(&mesh, &density(&mesh, spec.density, &settings), spec.distortion.objective(), &settings)?
-        .ok_or(ShrinkError::Unmapped)?;
+    let mut density = density(&mesh, spec.density, &settings);
+    let objective = spec.distortion.objective();
+    let mut map = sphere_map(&mesh, &density, objective, &settings)?.ok_or(ShrinkError::Unmapped)?;
     stage("resample", 0.75, None, Some(map.energy), None);
-    let directions = orient(&mesh, &map.directions, lattice.spec, &settings);
-    let (landed, normals) = land(&mesh, &directions, lattice, &settings)?;
+    let mut landing = Landing::new(&mesh, &map, lattice, &settings)?;
+    for round in 1..=DENSER {
+        let base = Base { mesh: &mesh, directions: &landing.directions };
+        let missed = missed(&base, lattice, &landing.positions, settings.cancel)?;
+        if !denser(&mesh, &missed, &mut density) {
+            break;
+        }
+        map = again(&mesh, map, &density, objective, &settings)?;
+        stage("resample", 0.75 + 0.03 * round as f32, None, Some(map.energy), None);
+        landing = Landing::new(&mesh, &map, lattice, &settings)?;
+    }
+    let Landing { directions, positions: landed, normals } = landing;
     let edge = (mesh.area() / lattice.directions.len() as f64).sqrt();
     let mut at = project(&sampler, landed.clone(), &normals, edge, 1e-3 * edge)?;
     stage("untangle", 0.85, None, None, None);
@@ -119,6 +135,29 @@ fn one(
     let left = separate(scene, &mut wrap, &[&to_scene(&blunt), &to_scene(&landed)], places)?;
     stage("separate", 1.0, None, None, Some(left.folds as u64));
     Ok(wrap)
+}
+
+/// A lattice on the base surface.
+struct Landing {
+    /// Direction of every base vertex, in the lattice's turn.
+    directions: Vec<DVec3>,
+    /// Where every lattice vertex landed.
+    positions: Vec<DVec3>,
+    /// The base's normals there.
+    normals: Vec<DVec3>,
+}
+
+impl Landing {
+    fn new(
+        mesh: &Mesh,
+        map: &SphereMap,
+        lattice: &SphereLattice,
+        settings: &Settings<'_>,
+    ) -> Result<Self, Canceled> {
+        let directions = orient(mesh, &map.directions, lattice.spec, settings);
+        let (positions, normals) = land(mesh, &directions, lattice, settings)?;
+        Ok(Self { directions, positions, normals })
+    }
 }
 
 /// Moves vertices onto creases and to what the base has and the lattice misses, and turns diagonals along them. What that

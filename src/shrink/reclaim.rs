@@ -9,7 +9,7 @@ use super::unfold::Corners;
 use super::zero::OnZero;
 use crate::field::Sampler;
 use crate::field::mesh::closest_on_triangle;
-use crate::settings::Canceled;
+use crate::settings::{CancelToken, Canceled};
 use glam::DVec3;
 
 /// A vertex of the base farther than this from the lattice's triangles is lost, in usual edges of the lattice.
@@ -97,6 +97,16 @@ pub fn reclaim(
         (at.values[v as usize], at.gradients[v as usize]) = (values[k], gradients[k]);
     }
     Ok(moved)
+}
+
+/// How far every vertex of the base is from the triangles of a lattice that has landed on it.
+pub fn missed(base: &Base<'_>, lattice: &SphereLattice, landed: &[DVec3], cancel: &CancelToken) -> Result<Vec<f64>, Canceled> {
+    let triangles = lattice.triangles(&vec![false; lattice.quads.len()]);
+    let corners = Corners::new(landed.len(), &triangles);
+    let star = Star { triangles: &triangles, corners: &corners };
+    let near = nearest_directions(base, lattice, &star);
+    cancel.check()?;
+    Ok(near.into_iter().zip(&base.mesh.positions).map(|(v, &p)| star.missed_by(landed, v, p)).collect())
 }
 
 /// The lattice's vertex in the direction of every vertex of the base, found by walking from the one that was found for a

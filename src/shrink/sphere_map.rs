@@ -74,6 +74,28 @@ pub fn sphere_map(
     Ok(result.map(|(map, _)| map))
 }
 
+/// The map for another `density`, from one of the same mesh that is there.
+pub fn again(
+    mesh: &Mesh,
+    map: SphereMap,
+    density: &[f64],
+    objective: Objective,
+    settings: &Settings<'_>,
+) -> Result<SphereMap, Canceled> {
+    settings.pool.install(|| {
+        let mut map = Inserter {
+            positions: &mesh.positions,
+            directions: map.directions,
+            rings: mesh.rings.clone(),
+            scales: scales(mesh, density),
+            objective,
+            star: Star::default(),
+        };
+        let mut active: Vec<u32> = (0..mesh.positions.len() as u32).collect();
+        Ok(map.finish(&mut active, settings)?.0)
+    })
+}
+
 /// The map, and how its last descent went.
 fn map_and_descent(
     mesh: &Mesh,
@@ -121,11 +143,7 @@ fn map_and_descent(
             map.take(&level, &places);
         }
     }
-    let (level, mut places) = map.level(&mut active, settings);
-    sweep(&level, &mut places, LAST_SWEEPS, &objective, settings)?;
-    let descent = descend(&level, &mut places, &objective, FINE, settings)?;
-    map.take(&level, &places);
-    Ok(Some((SphereMap { directions: map.directions, energy: descent.energy / (4.0 * PI) }, descent)))
+    map.finish(&mut active, settings).map(Some)
 }
 
 /// Squared lengths on the sphere per squared length on the mesh that are asked for at every vertex, so that the whole mesh
@@ -183,6 +201,16 @@ impl Inserter<'_> {
         let reference = |t| reference(self.positions, &self.scales, t);
         let ring = |v| self.rings.ring(v);
         (Level::new(active.to_vec(), self.positions.len(), ring, reference, settings), places)
+    }
+
+    /// The map with all vertices in place brought to its minimum, and how that went.
+    fn finish(&mut self, active: &mut [u32], settings: &Settings<'_>) -> Result<(SphereMap, Descent), Canceled> {
+        let (level, mut places) = self.level(active, settings);
+        sweep(&level, &mut places, LAST_SWEEPS, &self.objective, settings)?;
+        let descent = descend(&level, &mut places, &self.objective, FINE, settings)?;
+        self.take(&level, &places);
+        let directions = std::mem::take(&mut self.directions);
+        Ok((SphereMap { directions, energy: descent.energy / (4.0 * PI) }, descent))
     }
 
     /// Takes places back from a level.
