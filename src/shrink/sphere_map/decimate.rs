@@ -87,9 +87,9 @@ impl<'a> Costs<'a> {
         self.normals.clear();
         self.normals.extend((0..ring.len()).map(|i| self.mesh.normal([v, ring[i], next(i)])));
         self.choices.clear();
-        for k in 0..ring.len() {
-            let cost = self.cost(rings, v, ring[k], positions[ring[k] as usize]);
-            self.choices.push((cost, ring[k]));
+        for &w in ring {
+            let cost = self.cost(rings, v, w, positions[w as usize]);
+            self.choices.push((cost, w));
         }
         // few neighbours are not collapsible, and to know it takes longer than to know the cost
         while let Some(k) = (0..self.choices.len()).min_by(|&a, &b| self.choices[a].0.total_cmp(&self.choices[b].0)) {
