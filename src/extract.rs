@@ -261,10 +261,10 @@ mod tests {
         ShrinkSpec { lattice, ..ShrinkSpec::default() }
     }
 
-    /// A fork, whose tines eighteen vertices cannot follow.
+    /// A fork, whose tines thirty-eight vertices cannot follow.
     fn hopeless() -> (Scene, ShrinkSpec) {
         let fork = serde_json::from_str(include_str!("../examples/scenes/fork.json")).expect("JSON");
-        (scene(fork), spec(LatticeSpec::Octahedral { n: 2 }))
+        (scene(fork), spec(LatticeSpec::Octahedral { n: 3 }))
     }
 
     /// Runs and returns what was told besides.
