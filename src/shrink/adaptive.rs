@@ -3,13 +3,13 @@
 use super::base::base;
 use super::contract::{Refusal, Resolution, contract};
 use super::creases::{choose_diagonals, snap};
-use super::denser::denser;
+use super::denser::{denser, denser_at};
 use super::density::density;
 use super::lattice::SphereLattice;
 use super::reclaim::{Base, missed, reclaim};
 use super::resample::{land, orient};
-use super::separate::separate;
 use super::rings::Mesh;
+use super::separate::separate;
 use super::sphere_map::{SphereMap, again, sphere_map};
 use super::unfold::Corners;
 use super::untangle::Tangle;
@@ -24,18 +24,21 @@ struct Attempt {
     resolution: Resolution,
     /// Factor on [`base_vertices`].
     fineness: f64,
+    /// Share of the base's diagonal that the lattice may miss the base by before more of the sphere is asked for there: in
+    /// the first attempt a little more than half of what a result may miss, because the field still has to be met.
+    missed: f64,
     /// Where its share of the progress starts and ends.
     share: (f32, f32),
 }
 
 const ATTEMPTS: [Attempt; 3] = [
-    Attempt { resolution: Resolution { levels: 3, probe: true, local: 0 }, fineness: 1.0, share: (0.0, 0.7) },
-    Attempt { resolution: Resolution { levels: 3, probe: true, local: 2 }, fineness: 2.0, share: (0.7, 0.9) },
-    Attempt { resolution: Resolution { levels: 4, probe: false, local: 1 }, fineness: 2.0, share: (0.9, 1.0) },
+    Attempt { resolution: Resolution { levels: 3, local: 0 }, fineness: 1.0, missed: 0.0055, share: (0.0, 0.7) },
+    Attempt { resolution: Resolution { levels: 3, local: 2 }, fineness: 2.0, missed: 0.0035, share: (0.7, 0.9) },
+    Attempt { resolution: Resolution { levels: 4, local: 1 }, fineness: 2.0, missed: 0.0025, share: (0.9, 1.0) },
 ];
 
 /// Rounds of asking for more of the sphere where the lattice misses the base.
-const DENSER: usize = 3;
+const DENSER: usize = 4;
 
 /// Vertices of the base surface that a lattice is sampled from: half as many as the default lattice has, and more slowly
 /// growing than the lattice, because what is finer than the base the field itself says.
@@ -95,6 +98,8 @@ fn one(
     let mesh = base(front, (attempt.fineness * base_vertices(lattice)) as usize, &sampler)?;
     stage("map", 0.45, Some(show(&mesh.positions, mesh.rings.triangles())), None, None);
     let mut density = density(&mesh, spec.density, &settings);
+    let wanting: Vec<DVec3> = places.iter().map(|&p| frame.from_scene(p)).collect();
+    denser_at(&mesh, &wanting, &mut density);
     let objective = spec.distortion.objective();
     let mut map = sphere_map(&mesh, &density, objective, &settings)?.ok_or(ShrinkError::Unmapped)?;
     stage("resample", 0.75, None, Some(map.energy), None);
@@ -102,11 +107,11 @@ fn one(
     for round in 1..=DENSER {
         let base = Base { mesh: &mesh, directions: &landing.directions };
         let missed = missed(&base, lattice, &landing.positions, settings.cancel)?;
-        if !denser(&mesh, &missed, &mut density) {
+        if !denser(&mesh, &missed, attempt.missed, &mut density) {
             break;
         }
         map = again(&mesh, map, &density, objective, &settings)?;
-        stage("resample", 0.75 + 0.03 * round as f32, None, Some(map.energy), None);
+        stage("resample", 0.75 + 0.02 * round as f32, None, Some(map.energy), None);
         landing = Landing::new(&mesh, &map, lattice, &settings)?;
     }
     let Landing { directions, positions: landed, normals } = landing;
@@ -148,12 +153,7 @@ struct Landing {
 }
 
 impl Landing {
-    fn new(
-        mesh: &Mesh,
-        map: &SphereMap,
-        lattice: &SphereLattice,
-        settings: &Settings<'_>,
-    ) -> Result<Self, Canceled> {
+    fn new(mesh: &Mesh, map: &SphereMap, lattice: &SphereLattice, settings: &Settings<'_>) -> Result<Self, Canceled> {
         let directions = orient(mesh, &map.directions, lattice.spec, settings);
         let (positions, normals) = land(mesh, &directions, lattice, settings)?;
         Ok(Self { directions, positions, normals })

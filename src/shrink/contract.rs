@@ -62,8 +62,6 @@ impl<E: Into<ShrinkError>> From<E> for Refusal {
 pub struct Resolution {
     /// Doublings of the coarsest lattice.
     pub levels: u32,
-    /// Whether thin walls are probed for (a probe can also bridge a narrow gap).
-    pub probe: bool,
     /// Rounds of halving beside thin walls, narrow gaps and places that were found wanting.
     pub local: u32,
 }
@@ -133,7 +131,7 @@ pub fn contract(scene: &Sampler<'_>, resolution: Resolution, places: &[DVec3]) -
     let mut round = 0;
     loop {
         let complex = grid.complex(&settings)?;
-        let Marked { target, walls, gaps, narrow } = mark(&sampler, &grid, &complex, resolution.probe)?;
+        let Marked { target, walls, gaps, narrow } = mark(&sampler, &grid, &complex)?;
         let inside = carve(&complex, &target, settings.cancel)?;
         let limit = (OBSTRUCTION * h) as f32;
         let stuck = |i: usize| inside[i] && target[i] > 0.0;
@@ -186,10 +184,10 @@ pub(super) struct Marked {
     narrow: Vec<bool>,
 }
 
-/// Finds thin walls, if `probe` asks for it, and narrow gaps.
-pub(super) fn mark(sampler: &Sampler<'_>, grid: &Graded, complex: &Complex, probe: bool) -> Result<Marked, Canceled> {
+/// Finds thin walls and narrow gaps.
+pub(super) fn mark(sampler: &Sampler<'_>, grid: &Graded, complex: &Complex) -> Result<Marked, Canceled> {
     let mut narrow = vec![false; complex.len()];
-    let walls = if probe { thin(sampler, grid, complex, Thin::Wall, &mut narrow)? } else { Vec::new() };
+    let walls = thin(sampler, grid, complex, Thin::Wall, &mut narrow)?;
     let gaps = thin(sampler, grid, complex, Thin::Gap, &mut narrow)?;
     let mut target = grid.values.clone();
     for &(i, _) in &walls {
@@ -446,7 +444,7 @@ mod tests {
     use crate::measure::nearest::Nearest;
     use serde_json::{Value, json};
 
-    const FIRST: Resolution = Resolution { levels: 2, probe: true, local: 0 };
+    const FIRST: Resolution = Resolution { levels: 2, local: 0 };
 
     fn contracted(scene: Value, resolution: Resolution, places: &[DVec3]) -> Result<Front, ShrinkError> {
         let scene = Scene::from_value(&scene).unwrap();

@@ -2,10 +2,8 @@
 //! may be, the density rises, and the map is brought to its new minimum. The field is not asked.
 
 use super::rings::Mesh;
+use glam::DVec3;
 
-/// A base vertex farther from the lattice's triangles than this share of the base's diagonal is missed: a little more than
-/// half of what a result may miss, because the field still has to be met.
-const MISSED: f64 = 0.0055;
 /// Density rises by at most this factor in a round.
 const RISE: f64 = 3.0;
 /// Largest density over the smallest.
@@ -13,10 +11,28 @@ const RANGE: f64 = 40.0;
 /// Rings of neighbours that a rise is carried on to, falling to nothing: so far a limb's tip and its flanks are one feature.
 const RINGS: usize = 6;
 
-/// Raises `density` where the base is `missed` by more than it may be (a distance per vertex). Returns whether it was anywhere.
-pub fn denser(mesh: &Mesh, missed: &[f64], density: &mut [f64]) -> bool {
-    let (lo, hi) = mesh.positions.iter().fold((mesh.positions[0], mesh.positions[0]), |(lo, hi), &p| (lo.min(p), hi.max(p)));
-    let limit = MISSED * lo.distance(hi);
+/// Places where a surface was found wanting reach so far, as a share of the base's diagonal.
+const AROUND: f64 = 0.02;
+
+/// Length of the diagonal of a mesh's box.
+fn diagonal(mesh: &Mesh) -> f64 {
+    let (lo, hi) =
+        mesh.positions.iter().fold((mesh.positions[0], mesh.positions[0]), |(lo, hi), &p| (lo.min(p), hi.max(p)));
+    lo.distance(hi)
+}
+
+/// Raises `density` around the places where the surface before was found wanting, in the mesh's frame.
+pub fn denser_at(mesh: &Mesh, places: &[DVec3], density: &mut [f64]) {
+    let reach = AROUND * diagonal(mesh);
+    let near = |p: &DVec3| places.iter().any(|q| q.distance(*p) < reach);
+    let missed: Vec<f64> = mesh.positions.iter().map(|p| if near(p) { RISE * reach } else { 0.0 }).collect();
+    denser(mesh, &missed, AROUND, density);
+}
+
+/// Raises `density` where the base is `missed` (a distance per vertex) by more than `share` of its diagonal. Returns whether
+/// that was anywhere.
+pub fn denser(mesh: &Mesh, missed: &[f64], share: f64, density: &mut [f64]) -> bool {
+    let limit = share * diagonal(mesh);
     // rises as logarithms, carried on by the larger of a vertex's own and a share of its neighbours'
     let mut rise: Vec<f64> = missed.iter().map(|m| (m / limit).clamp(1.0, RISE).ln()).collect();
     if rise.iter().all(|&r| r == 0.0) {
@@ -51,21 +67,30 @@ mod tests {
         Mesh { positions: lattice.directions.clone(), rings }
     }
 
+    /// A vertex on the other side.
+    fn far_from(mesh: &Mesh) -> usize {
+        let along = |v: &usize| mesh.positions[*v].dot(mesh.positions[100]);
+        (0..mesh.positions.len()).min_by(|a, b| along(a).total_cmp(&along(b))).unwrap()
+    }
+
     #[test]
     fn density_rises_around_what_is_missed_and_nowhere_else() {
         let mesh = sphere();
         let n = mesh.positions.len();
         let (mut density, mut missed) = (vec![1.0; n], vec![0.0; n]);
-        assert!(!denser(&mesh, &missed, &mut density) && density.iter().all(|&d| d == 1.0));
+        assert!(!denser(&mesh, &missed, 0.005, &mut density) && density.iter().all(|&d| d == 1.0));
         missed[100] = 1.0;
-        assert!(denser(&mesh, &missed, &mut density));
+        assert!(denser(&mesh, &missed, 0.005, &mut density));
         assert_eq!(density[100], RISE);
         let neighbour = density[mesh.rings.ring(100)[0] as usize];
         assert!(neighbour > 1.0 && neighbour < RISE, "{neighbour}");
         let far = (0..n).filter(|&v| mesh.positions[v].dot(mesh.positions[100]) < -0.5);
         assert!(far.into_iter().all(|v| density[v] == 1.0));
+        let mut around = vec![1.0; n];
+        denser_at(&mesh, &[mesh.positions[100]], &mut around);
+        assert_eq!((around[100], around[far_from(&mesh)]), (RISE, 1.0));
         for _ in 0..10 {
-            denser(&mesh, &missed, &mut density);
+            denser(&mesh, &missed, 0.005, &mut density);
         }
         assert_eq!(density[100], RANGE);
     }

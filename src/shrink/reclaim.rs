@@ -100,7 +100,12 @@ pub fn reclaim(
 }
 
 /// How far every vertex of the base is from the triangles of a lattice that has landed on it.
-pub fn missed(base: &Base<'_>, lattice: &SphereLattice, landed: &[DVec3], cancel: &CancelToken) -> Result<Vec<f64>, Canceled> {
+pub fn missed(
+    base: &Base<'_>,
+    lattice: &SphereLattice,
+    landed: &[DVec3],
+    cancel: &CancelToken,
+) -> Result<Vec<f64>, Canceled> {
     let triangles = lattice.triangles(&vec![false; lattice.quads.len()]);
     let corners = Corners::new(landed.len(), &triangles);
     let star = Star { triangles: &triangles, corners: &corners };

@@ -75,7 +75,7 @@ pub fn study<'a>(sampler: &Sampler<'a>, spec: &ShrinkSpec, depth: u32) -> Result
     }
     sampler.tally().stage("topology");
     let cancel = sampler.settings().cancel;
-    let resolution = Resolution { levels: LEVELS + depth.min(DEEPEST), probe: true, local: 0 };
+    let resolution = Resolution { levels: LEVELS + depth.min(DEEPEST), local: 0 };
     let Lattice { mut grid, frame, slope } = lattice(sampler, resolution).map_err(|refusal| refusal.error)?;
     let h = grid.h();
     let limit = (OBSTRUCTION * h) as f32;
@@ -144,7 +144,7 @@ fn look(sampler: &Sampler<'_>, grid: &mut Graded, limit: f32) -> Result<(Complex
     let mut round = 0;
     loop {
         let complex = grid.complex(sampler.settings())?;
-        let values = mark(sampler, grid, &complex, true)?.target;
+        let values = mark(sampler, grid, &complex)?.target;
         let inside = carve(&complex, &values, sampler.settings().cancel)?;
         let coarse = |i: &usize| inside[*i] && values[*i] > limit && complex.spacing(*i) > 1.5 * fine;
         let nodes: Vec<(usize, i32)> = (0..complex.len()).filter(coarse).map(|i| (i, complex.sides[i])).collect();
