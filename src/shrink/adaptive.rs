@@ -33,8 +33,8 @@ struct Attempt {
 
 const ATTEMPTS: [Attempt; 3] = [
     Attempt { resolution: Resolution { levels: 3, local: 0 }, fineness: 1.0, missed: 0.0055, share: (0.0, 0.7) },
-    Attempt { resolution: Resolution { levels: 3, local: 2 }, fineness: 2.0, missed: 0.0035, share: (0.7, 0.9) },
-    Attempt { resolution: Resolution { levels: 4, local: 1 }, fineness: 2.0, missed: 0.0025, share: (0.9, 1.0) },
+    Attempt { resolution: Resolution { levels: 3, local: 2 }, fineness: 2.0, missed: 0.003, share: (0.7, 0.9) },
+    Attempt { resolution: Resolution { levels: 4, local: 1 }, fineness: 2.0, missed: 0.0015, share: (0.9, 1.0) },
 ];
 
 /// Rounds of asking for more of the sphere where the lattice misses the base.
