@@ -244,9 +244,9 @@ impl Told<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::Field;
     use crate::field::sampler::Tally;
     use crate::field::scene::Scene;
+    use crate::field::{Domain, Field, Gradients, Metric, Points};
     use crate::measure::fixtures::with_settings;
     use crate::settings::CancelToken;
     use crate::shrink::lattice::LatticeSpec;
@@ -261,10 +261,34 @@ mod tests {
         ShrinkSpec { lattice, ..ShrinkSpec::default() }
     }
 
-    /// A fork, whose tines thirty-eight vertices cannot follow.
-    fn hopeless() -> (Scene, ShrinkSpec) {
-        let fork = serde_json::from_str(include_str!("../examples/scenes/fork.json")).expect("JSON");
-        (scene(fork), spec(LatticeSpec::Octahedral { n: 3 }))
+    /// A field whose gradients point inward: whatever is made of it, no triangle agrees with them.
+    struct Contrary(Scene);
+
+    impl Field for Contrary {
+        fn domain(&self) -> Domain {
+            self.0.domain()
+        }
+        fn metric(&self) -> Metric {
+            self.0.metric()
+        }
+        fn lipschitz(&self) -> Option<f32> {
+            self.0.lipschitz()
+        }
+        fn values(&self, points: Points<'_>, values: &mut [f32]) {
+            self.0.values(points, values);
+        }
+        fn gradients(&self, points: Points<'_>, values: &mut [f32], gradients: Gradients<'_>) {
+            let Gradients { x, y, z } = gradients;
+            self.0.gradients(points, values, Gradients { x: &mut *x, y: &mut *y, z: &mut *z });
+            for g in x.iter_mut().chain(y).chain(z) {
+                *g = -*g;
+            }
+        }
+    }
+
+    fn hopeless() -> (Contrary, ShrinkSpec) {
+        let ball = scene(json!({"sphere": {"radius": 0.6}}));
+        (Contrary(ball), spec(LatticeSpec::Octahedral { n: 6 }))
     }
 
     /// Runs and returns what was told besides.
@@ -305,7 +329,8 @@ mod tests {
         assert!(!verdict.passed && !verdict.faults.is_empty());
         assert!(verdict.faults.iter().any(|f| !f.places.is_empty()), "it says where: {verdict:?}");
         assert_eq!(made.report.attempts, Effort::ATTEMPTS);
-        assert_eq!(parts.len(), 2 * Effort::ATTEMPTS as usize);
+        // folded triangles are first repaired where they are
+        assert_eq!(parts.len(), 2 * (1 + REPAIRS as usize) * Effort::ATTEMPTS as usize);
         let counted = made.report.evaluations.value + made.report.evaluations.gradient;
         assert_eq!(counted, spent, "the evaluations of all attempts are counted");
         assert!(news.windows(2).all(|w| w[0].fraction <= w[1].fraction), "progress never falls");

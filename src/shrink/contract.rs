@@ -454,23 +454,29 @@ mod tests {
         })
     }
 
-    /// Distance of a place from a front, scene units.
-    fn distance(front: &Front, p: DVec3) -> f64 {
+    /// Largest distance of places from a front, scene units.
+    fn distance(front: &Front, places: &[DVec3]) -> f64 {
         let positions: Vec<DVec3> = front.mesh.positions.iter().map(|&q| front.frame.to_scene(q)).collect();
-        Nearest::new(&positions, &front.mesh.rings.triangles()).closest(p).unwrap().point.distance(p)
+        let triangles = front.mesh.rings.triangles();
+        let nearest = Nearest::new(&positions, &triangles);
+        places.iter().map(|&p| nearest.closest(p).unwrap().point.distance(p)).fold(0.0, f64::max)
     }
 
-    /// A ball with a fin that is a third of a spacing thick.
-    fn fin() -> Value {
-        json!({"union": {"of": [{"sphere": {"radius": 0.5}},
-            {"translate": {"by": [0.0, 0.0, 0.45], "of": {"box": {"half_extents": [0.3, 0.006, 0.35]}}}}]}})
+    /// A box that no lattice plane goes along, and its corners.
+    fn block(half: DVec3, center: DVec3) -> (Value, Vec<DVec3>) {
+        let place = json!({"translate": {"by": center.to_array(), "of": {"box": {"half_extents": half.to_array()}}}});
+        let sign = |k: usize, a: usize| if k >> a & 1 == 1 { 1.0 } else { -1.0 };
+        (place, (0..8).map(|k| center + half * DVec3::new(sign(k, 0), sign(k, 1), sign(k, 2))).collect())
     }
 
     #[test]
     fn a_fin_thinner_than_the_lattice_is_kept_and_sharper_where_the_lattice_is_halved() {
-        let corner = DVec3::new(0.3, 0.006, 0.8);
-        let coarse = distance(&contracted(fin(), FIRST, &[]).unwrap(), corner);
-        let fine = distance(&contracted(fin(), Resolution { local: 2, ..FIRST }, &[]).unwrap(), corner);
+        // the fin is a third of a spacing thick
+        let (fin, corners) = block(DVec3::new(0.313, 0.006, 0.352), DVec3::new(0.017, 0.011, 0.451));
+        let tips: Vec<DVec3> = corners.into_iter().filter(|p| p.z > 0.5).collect();
+        let scene = json!({"union": {"of": [{"sphere": {"radius": 0.5}}, fin]}});
+        let coarse = distance(&contracted(scene.clone(), FIRST, &[]).unwrap(), &tips);
+        let fine = distance(&contracted(scene, Resolution { local: 2, ..FIRST }, &[]).unwrap(), &tips);
         // a spacing of the first lattice is 2 / 48
         assert!(coarse < 2.0 / 48.0, "{coarse}");
         assert!(fine < 0.6 * coarse, "{fine} beside {coarse}");
@@ -478,12 +484,11 @@ mod tests {
 
     #[test]
     fn a_place_that_was_found_wanting_is_looked_at_finer() {
-        let block = json!({"box": {"half_extents": [0.6, 0.5, 0.4]}});
-        let corner = DVec3::new(0.6, 0.5, 0.4);
+        let (scene, corners) = block(DVec3::new(0.613, 0.471, 0.427), DVec3::new(0.013, 0.021, -0.017));
         let resolution = Resolution { local: 2, ..FIRST };
-        let coarse = distance(&contracted(block.clone(), resolution, &[]).unwrap(), corner);
-        let fine = contracted(block, resolution, &[corner]).unwrap();
-        assert!(distance(&fine, corner) < 0.6 * coarse, "{} beside {coarse}", distance(&fine, corner));
+        let coarse = distance(&contracted(scene.clone(), resolution, &[]).unwrap(), &corners);
+        let fine = distance(&contracted(scene, resolution, &corners).unwrap(), &corners);
+        assert!(fine < 0.6 * coarse, "{fine} beside {coarse}");
     }
 
     #[test]

@@ -81,14 +81,15 @@ mod tests {
         assert!(!denser(&mesh, &missed, 0.005, &mut density) && density.iter().all(|&d| d == 1.0));
         missed[100] = 1.0;
         assert!(denser(&mesh, &missed, 0.005, &mut density));
-        assert_eq!(density[100], RISE);
+        assert!((density[100] - RISE).abs() < 1e-9);
         let neighbour = density[mesh.rings.ring(100)[0] as usize];
         assert!(neighbour > 1.0 && neighbour < RISE, "{neighbour}");
         let far = (0..n).filter(|&v| mesh.positions[v].dot(mesh.positions[100]) < -0.5);
         assert!(far.into_iter().all(|v| density[v] == 1.0));
         let mut around = vec![1.0; n];
         denser_at(&mesh, &[mesh.positions[100]], &mut around);
-        assert_eq!((around[100], around[far_from(&mesh)]), (RISE, 1.0));
+        assert!((around[100] - RISE).abs() < 1e-9);
+        assert_eq!(around[far_from(&mesh)], 1.0);
         for _ in 0..10 {
             denser(&mesh, &missed, 0.005, &mut density);
         }
