@@ -473,12 +473,20 @@ impl Graded {
         Some((0..8).map(term).sum())
     }
 
-    /// The nearest corner of the smallest whole cube around a place; beyond the box, around the nearest place in it.
+    /// A node near a place: the nearest one on the finest lattice that has one there; beyond the box, near the nearest place
+    /// in it.
     pub fn nearest(&self, p: DVec3) -> usize {
         let q = (p - self.origin) / self.unit;
-        let (cube, corners) = self.cell(q);
-        let t = (q - DVec3::from(cube.low.map(f64::from))) / f64::from(cube.side);
-        corners[(0..3).map(|a| usize::from(t[a] > 0.5) << a).sum::<usize>()] as usize
+        let mut side = self.side;
+        loop {
+            let on = (q / f64::from(side)).round();
+            let place = [0, 1, 2].map(|a| (on[a] as i32).clamp(0, self.extent[a] / side) * side);
+            match self.node(place) {
+                Some(i) => return i as usize,
+                // the first lattice is whole
+                None => side *= 2,
+            }
+        }
     }
 
     /// The nodes within a box of half side `reach` around a place, as far as they are on the lattice of the spacing

@@ -68,7 +68,8 @@ impl Mended<'_> {
         let step = (self.slope * territory.spacing()) as f32;
         match territory.label(p) {
             Label::Keep => value,
-            Label::Away => value.max(AWAY as f32 * step),
+            // as if it were turned inside out: a contraction goes through it as through free space
+            Label::Away => value.abs().max(AWAY as f32 * step),
             Label::Fill => value.min(-FILL as f32 * step),
         }
     }

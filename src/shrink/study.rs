@@ -200,7 +200,7 @@ fn settle(
     for (value, label) in values.iter_mut().zip(&labels) {
         match label {
             Label::Keep => {}
-            Label::Away => *value = value.max(h),
+            Label::Away => *value = value.abs().max(h),
             Label::Fill => *value = value.min(-h),
         }
     }
