@@ -550,7 +550,7 @@ fn ends(place: Place) -> [Place; 2] {
     for a in 0..3 {
         if place[a] & step != 0 {
             // the diagonal goes from the even corner to the odd one
-            let sign = if (place[a] - step) & 2 * step == 0 { step } else { -step };
+            let sign = if (place[a] - step) & (2 * step) == 0 { step } else { -step };
             ends[0][a] -= sign;
             ends[1][a] += sign;
         }

@@ -157,7 +157,7 @@ impl System {
         });
         let edges = level.map_rows(settings, |v, out: &mut Vec<Mat2>| {
             // the edge to a ring's entry has a triangle on either side: the one from there on, and the one before
-            let mut last = around(v).last().map_or(DMat2::ZERO, |(t, corner)| t.before(corner));
+            let mut last = around(v).next_back().map_or(DMat2::ZERO, |(t, corner)| t.before(corner));
             for (t, corner) in around(v) {
                 out.push((last + t.after(corner)).as_mat2());
                 last = t.before(corner);
