@@ -85,3 +85,33 @@ impl Field for Balls {
         }
     }
 }
+
+/// A field of value and gradient by a formula, over a box of half side 1.5 about the origin, that changes by at most 1 per
+/// length.
+pub(crate) struct Formula<F> {
+    pub(crate) at: F,
+    pub(crate) metric: Metric,
+}
+
+impl<F: Fn(DVec3) -> (f64, DVec3) + Send + Sync> Field for Formula<F> {
+    fn domain(&self) -> Domain {
+        Domain { min: [-1.5; 3], max: [1.5; 3] }
+    }
+    fn metric(&self) -> Metric {
+        self.metric
+    }
+    fn lipschitz(&self) -> Option<f32> {
+        Some(1.0)
+    }
+    fn values(&self, p: Points<'_>, values: &mut [f32]) {
+        for (i, v) in values.iter_mut().enumerate() {
+            *v = (self.at)(DVec3::new(p.x[i].into(), p.y[i].into(), p.z[i].into())).0 as f32;
+        }
+    }
+    fn gradients(&self, p: Points<'_>, values: &mut [f32], g: Gradients<'_>) {
+        for (i, value) in values.iter_mut().enumerate() {
+            let (s, n) = (self.at)(DVec3::new(p.x[i].into(), p.y[i].into(), p.z[i].into()));
+            (*value, g.x[i], g.y[i], g.z[i]) = (s as f32, n.x as f32, n.y as f32, n.z as f32);
+        }
+    }
+}

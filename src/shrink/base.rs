@@ -67,8 +67,8 @@ fn onto_zero(mesh: &mut Mesh, sampler: &Sampler<'_>, reach: f64, turn: f64) -> R
 mod tests {
     use super::*;
     use crate::field::sampler::Tally;
-    use crate::field::{Domain, Field, Gradients, Metric, Points};
-    use crate::settings::{CancelToken, Settings};
+    use crate::field::{Field, Metric};
+    use crate::measure::fixtures::{Formula, with_settings};
     use crate::shrink::lattice::{LatticeSpec, SphereLattice};
     use crate::shrink::rings::Rings;
 
@@ -97,65 +97,19 @@ mod tests {
         }
     }
 
-    impl Field for Cone {
-        fn domain(&self) -> Domain {
-            Domain { min: [-1.5; 3], max: [1.5; 3] }
-        }
-        fn metric(&self) -> Metric {
-            Metric::Exact
-        }
-        fn lipschitz(&self) -> Option<f32> {
-            Some(1.0)
-        }
-        fn values(&self, p: Points<'_>, values: &mut [f32]) {
-            for (i, v) in values.iter_mut().enumerate() {
-                *v = self.at(DVec3::new(p.x[i].into(), p.y[i].into(), p.z[i].into())).0 as f32;
-            }
-        }
-        fn gradients(&self, p: Points<'_>, values: &mut [f32], g: Gradients<'_>) {
-            for (i, value) in values.iter_mut().enumerate() {
-                let (s, n) = self.at(DVec3::new(p.x[i].into(), p.y[i].into(), p.z[i].into()));
-                (*value, g.x[i], g.y[i], g.z[i]) = (s as f32, n.x as f32, n.y as f32, n.z as f32);
-            }
-        }
-    }
-
-    /// A cube's surface of this half side, and the field of it: the distance, but a bound beyond its edges.
-    struct Cube;
     const HALF: f64 = 0.6;
 
-    impl Field for Cube {
-        fn domain(&self) -> Domain {
-            Domain { min: [-1.5; 3], max: [1.5; 3] }
-        }
-        fn metric(&self) -> Metric {
-            Metric::Bound
-        }
-        fn lipschitz(&self) -> Option<f32> {
-            Some(1.0)
-        }
-        fn values(&self, p: Points<'_>, values: &mut [f32]) {
-            for (i, v) in values.iter_mut().enumerate() {
-                *v = p.x[i].abs().max(p.y[i].abs()).max(p.z[i].abs()) - HALF as f32;
-            }
-        }
-        fn gradients(&self, p: Points<'_>, values: &mut [f32], g: Gradients<'_>) {
-            self.values(p, values);
-            for i in 0..values.len() {
-                let q = DVec3::new(p.x[i].into(), p.y[i].into(), p.z[i].into());
-                let axis = (0..3).max_by(|&a, &b| q[a].abs().total_cmp(&q[b].abs())).unwrap_or(0);
-                let mut n = DVec3::ZERO;
-                n[axis] = q[axis].signum();
-                (g.x[i], g.y[i], g.z[i]) = (n.x as f32, n.y as f32, n.z as f32);
-            }
-        }
+    /// A cube of half side [`HALF`]: the distance, but a bound beyond its edges.
+    fn cube(p: DVec3) -> (f64, DVec3) {
+        let axis = (0..3).max_by(|&a, &b| p[a].abs().total_cmp(&p[b].abs())).unwrap_or(0);
+        let mut normal = DVec3::ZERO;
+        normal[axis] = p[axis].signum();
+        (p[axis].abs() - HALF, normal)
     }
 
     fn with_sampler<R>(field: &dyn Field, work: impl FnOnce(&Sampler<'_>) -> R) -> R {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
-        let cancel = CancelToken::new();
         let tally = Tally::new();
-        work(&Sampler::new(field, Settings { pool: &pool, cancel: &cancel, progress: &|_| {} }, &tally))
+        with_settings(2, |settings| work(&Sampler::new(field, *settings, &tally)))
     }
 
     /// A sphere lattice's directions, turned off the axes, at these distances from `center`.
@@ -201,7 +155,8 @@ mod tests {
         let top = DVec3::Z * (1.0 + TIP);
         for side in [1.0, -1.0] {
             let cone = Cone { side };
-            let mesh = with_sampler(&cone, |sampler| even(blunt_cone(&cone), 800, sampler).unwrap());
+            let field = Formula { at: |p| cone.at(p), metric: Metric::Exact };
+            let mesh = with_sampler(&field, |sampler| even(blunt_cone(&cone), 800, sampler).unwrap());
             let missed = missed(&mesh, top);
             assert!(missed < 0.1, "side {side}: missed by {missed} edges");
         }
@@ -209,7 +164,8 @@ mod tests {
 
     #[test]
     fn every_corner_and_every_edge_of_a_cube_is_kept() {
-        let mesh = with_sampler(&Cube, |sampler| {
+        let field = Formula { at: cube, metric: Metric::Bound };
+        let mesh = with_sampler(&field, |sampler| {
             let cube = shell(DVec3::ZERO, 30, false, |d| HALF / d.abs().max_element());
             even(cube, 800, sampler).unwrap()
         });

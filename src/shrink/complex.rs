@@ -1,5 +1,6 @@
 //! Tetrahedra that fit together, seen from their nodes: who is whose neighbour, and what a node's link looks like.
 
+use super::unfold::Corners;
 use glam::DVec3;
 
 /// A complex of tetrahedra that fills a box.
@@ -14,9 +15,7 @@ pub struct Complex {
     pub unit: f64,
     /// Whether a node is on the box's boundary.
     pub border: Vec<bool>,
-    /// Where the tetrahedra of every node begin in `stars`.
-    first: Vec<u32>,
-    stars: Vec<u32>,
+    corners: Corners,
 }
 
 impl Complex {
@@ -28,22 +27,8 @@ impl Complex {
         unit: f64,
         border: Vec<bool>,
     ) -> Self {
-        let n = positions.len();
-        let mut first = vec![0u32; n + 1];
-        for &v in tets.iter().flatten() {
-            first[v as usize + 1] += 1;
-        }
-        for v in 0..n {
-            first[v + 1] += first[v];
-        }
-        let (mut next, mut stars) = (first.clone(), vec![0; 4 * tets.len()]);
-        for (t, tet) in tets.iter().enumerate() {
-            for &v in tet {
-                stars[next[v as usize] as usize] = t as u32;
-                next[v as usize] += 1;
-            }
-        }
-        Self { positions, tets, sides, unit, border, first, stars }
+        let corners = Corners::new(positions.len(), &tets);
+        Self { positions, tets, sides, unit, border, corners }
     }
 
     /// Number of nodes.
@@ -51,8 +36,8 @@ impl Complex {
         self.positions.len()
     }
     /// Tetrahedra at a node.
-    pub fn star(&self, v: usize) -> &[u32] {
-        &self.stars[self.first[v] as usize..self.first[v + 1] as usize]
+    pub fn star(&self, v: usize) -> impl Iterator<Item = usize> {
+        self.corners.at(v as u32).iter().map(|&k| k as usize / 4)
     }
     /// Spacing of the lattice at a node.
     pub fn spacing(&self, v: usize) -> f64 {
@@ -71,8 +56,8 @@ impl Complex {
             let mut cluster = vec![start];
             let mut next = 0;
             while next < cluster.len() {
-                for &t in self.star(cluster[next]) {
-                    for j in self.tets[t as usize].map(|j| j as usize) {
+                for t in self.star(cluster[next]) {
+                    for j in self.tets[t].map(|j| j as usize) {
                         if set[j] && !seen[j] {
                             seen[j] = true;
                             cluster.push(j);
@@ -96,9 +81,9 @@ impl Complex {
             let counts = |u: u32| u as usize > v && set[u as usize];
             let own = (0..ring.nodes.len()).filter(|&k| counts(ring.nodes[k])).fold(0u64, |own, k| own | 1 << k);
             let joined: u32 = bits(own).map(|k| (ring.links[k] & own).count_ones()).sum();
-            let whole = |t: &&u32| self.tets[**t as usize].iter().all(|&u| u as usize == v || counts(u));
+            let whole = |t: &usize| self.tets[*t].iter().all(|&u| u as usize == v || counts(u));
             chi += 1 - i64::from(own.count_ones()) + i64::from(joined / 2);
-            chi -= self.star(v).iter().filter(whole).count() as i64;
+            chi -= self.star(v).filter(whole).count() as i64;
         }
         chi
     }
@@ -166,10 +151,10 @@ impl<'a> Rings<'a> {
         let Ring { nodes, links } = &mut self.ring;
         nodes.clear();
         links.clear();
-        for &t in self.complex.star(v) {
+        for t in self.complex.star(v) {
             let mut all = 0u64;
             let mut local = [usize::MAX; 4];
-            for (slot, u) in local.iter_mut().zip(self.complex.tets[t as usize]) {
+            for (slot, u) in local.iter_mut().zip(self.complex.tets[t]) {
                 if u as usize == v {
                     continue;
                 }
@@ -260,7 +245,7 @@ mod tests {
             assert!(ring.nodes.len() <= 26, "{}", ring.nodes.len());
             let edges: u32 = ring.links.iter().map(|links| links.count_ones()).sum::<u32>() / 2;
             // V - E + F = 2, and every triangle of the link belongs to one cell
-            assert_eq!(ring.nodes.len() as i64 - i64::from(edges) + complex.star(v).len() as i64, 2);
+            assert_eq!(ring.nodes.len() as i64 - i64::from(edges) + complex.star(v).count() as i64, 2);
         }
     }
 

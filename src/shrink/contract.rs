@@ -87,7 +87,7 @@ pub(super) fn lattice(scene: &Sampler<'_>, resolution: Resolution) -> Result<Lat
         grid.halve(scene, slope, MARGIN.0)?;
         Ok((grid, slope))
     };
-    let (mut grid, mut slope) = first(lo, hi, size)?;
+    let (mut grid, slope) = first(lo, hi, size)?;
     let mut deeper = 0;
     // a shape smaller than the lattice's cells shows itself only in a finer one
     while grid.solid_box(slope).is_none() && deeper < 3 {
@@ -104,9 +104,9 @@ pub(super) fn lattice(scene: &Sampler<'_>, resolution: Resolution) -> Result<Lat
         (lo, hi, size) = (solid_lo, solid_hi, solid);
     }
     if focused || deeper > 0 {
-        (grid, slope) = first(lo, hi, size)?;
+        (grid, _) = first(lo, hi, size)?;
     }
-    slope = slope_of(scene, &grid).max(if scene.field().metric() == Metric::Exact { slope } else { 0.0 });
+    let slope = slope_of(scene, &grid);
     for level in 2..=resolution.levels {
         grid.halve(scene, slope, if level == resolution.levels { MARGIN.1 } else { MARGIN.0 })?;
     }
@@ -295,8 +295,8 @@ fn embedded(complex: &Complex, moves: Vec<(usize, DVec3)>) -> HashMap<usize, DVe
     for round in 0..=ROUNDS {
         let place = |v: u32| moved.get(&(v as usize)).copied().unwrap_or(complex.positions[v as usize]);
         let squeezed = |&&(i, _): &&(usize, DVec3)| {
-            complex.star(i).iter().any(|&t| {
-                let tet = complex.tets[t as usize];
+            complex.star(i).any(|t| {
+                let tet = complex.tets[t];
                 volume(tet.map(place)) < SHARE * volume(tet.map(|v| complex.positions[v as usize]))
             })
         };

@@ -8,24 +8,24 @@
 use super::energy::{Reference, add_outer, newton_direction, tangents};
 use glam::{DMat3, DVec3};
 
-/// For every vertex the corners (3 * triangle + corner) that it is at.
+/// For every vertex the corners (3 * triangle + corner; of cells with K corners, K * cell + corner) that it is at.
 pub struct Corners {
     first: Vec<u32>,
     list: Vec<u32>,
 }
 
 impl Corners {
-    /// From triangles over `vertices` vertices.
-    pub fn new(vertices: usize, triangles: &[[u32; 3]]) -> Self {
+    /// From triangles, or other cells, over `vertices` vertices.
+    pub fn new<const K: usize>(vertices: usize, cells: &[[u32; K]]) -> Self {
         let mut first = vec![0u32; vertices + 1];
-        for &v in triangles.iter().flatten() {
+        for &v in cells.iter().flatten() {
             first[v as usize + 1] += 1;
         }
         for v in 0..vertices {
             first[v + 1] += first[v];
         }
-        let (mut next, mut list) = (first.clone(), vec![0; 3 * triangles.len()]);
-        for (corner, &v) in triangles.iter().flatten().enumerate() {
+        let (mut next, mut list) = (first.clone(), vec![0; K * cells.len()]);
+        for (corner, &v) in cells.iter().flatten().enumerate() {
             list[next[v as usize] as usize] = corner as u32;
             next[v as usize] += 1;
         }

@@ -1,48 +1,20 @@
 use super::*;
+use crate::field::Metric;
 use crate::field::sampler::Tally;
-use crate::field::{Domain, Field, Gradients, Metric, Points};
-use crate::settings::{CancelToken, Settings};
+use crate::measure::fixtures::{Formula, with_settings};
 use crate::shrink::lattice::LatticeSpec;
 
-/// A round plate of radius 1 and thickness `THICK` in the plane z = 0, far thinner than the lattice's edges.
-struct Plate;
 const THICK: f64 = 0.02;
 
-impl Plate {
-    fn at(p: DVec3) -> (f64, DVec3) {
-        let (ball, plate) = (p.length() - 1.0, p.z.abs() - 0.5 * THICK);
-        if plate >= ball { (plate, DVec3::new(0.0, 0.0, p.z.signum())) } else { (ball, p.normalize_or(DVec3::X)) }
-    }
-}
-
-impl Field for Plate {
-    fn domain(&self) -> Domain {
-        Domain { min: [-1.5; 3], max: [1.5; 3] }
-    }
-    fn metric(&self) -> Metric {
-        Metric::Bound
-    }
-    fn lipschitz(&self) -> Option<f32> {
-        Some(1.0)
-    }
-    fn values(&self, p: Points<'_>, values: &mut [f32]) {
-        for (i, v) in values.iter_mut().enumerate() {
-            *v = Self::at(DVec3::new(p.x[i].into(), p.y[i].into(), p.z[i].into())).0 as f32;
-        }
-    }
-    fn gradients(&self, p: Points<'_>, values: &mut [f32], g: Gradients<'_>) {
-        for (i, value) in values.iter_mut().enumerate() {
-            let (s, n) = Self::at(DVec3::new(p.x[i].into(), p.y[i].into(), p.z[i].into()));
-            (*value, g.x[i], g.y[i], g.z[i]) = (s as f32, n.x as f32, n.y as f32, n.z as f32);
-        }
-    }
+/// A round plate of radius 1 and thickness [`THICK`] in the plane z = 0, far thinner than the lattice's edges.
+fn plate(p: DVec3) -> (f64, DVec3) {
+    let (ball, plate) = (p.length() - 1.0, p.z.abs() - 0.5 * THICK);
+    if plate >= ball { (plate, DVec3::new(0.0, 0.0, p.z.signum())) } else { (ball, p.normalize_or(DVec3::X)) }
 }
 
 fn with_sampler<R>(threads: usize, work: impl FnOnce(&Sampler<'_>) -> R) -> R {
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-    let cancel = CancelToken::new();
-    let tally = Tally::new();
-    work(&Sampler::new(&Plate, Settings { pool: &pool, cancel: &cancel, progress: &|_| {} }, &tally))
+    let (field, tally) = (Formula { at: plate, metric: Metric::Bound }, Tally::new());
+    with_settings(threads, |settings| work(&Sampler::new(&field, *settings, &tally)))
 }
 
 /// The upper and lower halves of a sphere lattice pressed onto the plate's two faces.

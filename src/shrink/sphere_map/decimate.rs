@@ -137,21 +137,57 @@ impl<'a> Costs<'a> {
     }
 }
 
+/// Target of a vertex that waits for its surroundings to change, because it cannot be collapsed as they are.
+const NONE: u32 = u32::MAX;
+
+/// The vertices in the order of their costs.
+struct Queue {
+    heap: BinaryHeap<Candidate>,
+    /// A candidate whose stamp is not its vertex's own is out of date.
+    stamps: Vec<u32>,
+    targets: Vec<u32>,
+    /// Whether a vertex's surroundings have changed since it was looked at.
+    stale: Vec<bool>,
+}
+
+impl Queue {
+    fn new(vertices: usize) -> Self {
+        let heap = BinaryHeap::new();
+        Self { heap, stamps: vec![0; vertices], targets: vec![NONE; vertices], stale: vec![false; vertices] }
+    }
+    fn push(&mut self, v: u32, target: u32, cost: f64) {
+        self.targets[v as usize] = target;
+        self.heap.push(Candidate { cost, vertex: v, stamp: self.stamps[v as usize] });
+    }
+    /// Gives a vertex the place that its cheapest collapse has now.
+    fn look_at(&mut self, costs: &mut Costs<'_>, rings: &Rings, v: u32) {
+        self.stamps[v as usize] += 1;
+        self.stale[v as usize] = false;
+        self.targets[v as usize] = NONE;
+        if let Some((cost, target)) = costs.cheapest(rings, v) {
+            self.push(v, target, cost);
+        }
+    }
+    /// Notes that the surroundings of a vertex have changed. One that waited for that gets its turn, at `target` for a start.
+    fn touch(&mut self, v: u32, target: u32) {
+        self.stale[v as usize] = true;
+        if self.targets[v as usize] == NONE {
+            self.stamps[v as usize] += 1;
+            self.push(v, target, 0.0);
+        }
+    }
+}
+
 /// Collapses to four vertices, about the cheapest half-edge first: a vertex whose surroundings have changed is looked at
 /// again when its turn comes, for most changes make it dearer. `None` when that is impossible.
 pub fn decimate(mesh: &Mesh, rings: &mut Rings, cancel: &CancelToken) -> Result<Option<Vec<Collapse>>, Canceled> {
     let n = mesh.positions.len();
-    let mut costs = Costs::new(mesh);
-    /// Target of a vertex that waits for its surroundings to change, because it cannot be collapsed as they are.
-    const NONE: u32 = u32::MAX;
-    // a candidate whose stamp is not its vertex's own is out of date
-    let (mut stamps, mut targets, mut stale) = (vec![0u32; n], vec![NONE; n], vec![false; n]);
-    let mut heap = BinaryHeap::new();
+    let (mut costs, mut queue) = (Costs::new(mesh), Queue::new(n));
     let mut log = Vec::with_capacity(n);
     let mut alive = (0..n as u32).filter(|&v| rings.alive(v)).count();
     let mut refilled_at = usize::MAX;
     while alive > 4 {
-        let Some(Candidate { vertex: v, stamp, .. }) = heap.pop() else {
+        let Some(Candidate { vertex: v, stamp, .. }) = queue.heap.pop() else {
             // edges become collapsible again when links change farther away
             if refilled_at == alive {
                 return Ok(None);
@@ -161,28 +197,16 @@ pub fn decimate(mesh: &Mesh, rings: &mut Rings, cancel: &CancelToken) -> Result<
                 if v.is_multiple_of(1024) {
                     cancel.check()?;
                 }
-                stamps[v as usize] += 1;
-                stale[v as usize] = false;
-                targets[v as usize] = NONE;
-                if let Some((cost, w)) = costs.cheapest(rings, v) {
-                    targets[v as usize] = w;
-                    heap.push(Candidate { cost, vertex: v, stamp: stamps[v as usize] });
-                }
+                queue.look_at(&mut costs, rings, v);
             }
             continue;
         };
-        if !rings.alive(v) || stamp != stamps[v as usize] {
+        if !rings.alive(v) || stamp != queue.stamps[v as usize] {
             continue;
         }
-        let w = targets[v as usize];
-        if stale[v as usize] || !rings.joined(v, w) || !rings.collapsible(v, w) {
-            stamps[v as usize] += 1;
-            stale[v as usize] = false;
-            targets[v as usize] = NONE;
-            if let Some((cost, x)) = costs.cheapest(rings, v) {
-                targets[v as usize] = x;
-                heap.push(Candidate { cost, vertex: v, stamp: stamps[v as usize] });
-            }
+        let w = queue.targets[v as usize];
+        if queue.stale[v as usize] || !rings.joined(v, w) || !rings.collapsible(v, w) {
+            queue.look_at(&mut costs, rings, v);
             continue;
         }
         log.push((v, rings.collapse(v, w)));
@@ -193,12 +217,7 @@ pub fn decimate(mesh: &Mesh, rings: &mut Rings, cancel: &CancelToken) -> Result<
             cancel.check()?;
         }
         for &u in rings.ring(w).iter().chain([&w]) {
-            stale[u as usize] = true;
-            if targets[u as usize] == NONE {
-                targets[u as usize] = w;
-                stamps[u as usize] += 1;
-                heap.push(Candidate { cost: 0.0, vertex: u, stamp: stamps[u as usize] });
-            }
+            queue.touch(u, w);
         }
     }
     Ok(Some(log))
