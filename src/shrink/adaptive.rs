@@ -4,7 +4,7 @@ use super::base::base;
 use super::contract::{Refusal, Resolution, contract};
 use super::creases::{choose_diagonals, snap};
 use super::denser::{denser, denser_at};
-use super::density::density;
+use super::density::Sampling;
 use super::lattice::SphereLattice;
 use super::reclaim::{Base, missed, reclaim};
 use super::resample::{land, orient};
@@ -14,7 +14,7 @@ use super::sphere_map::{SphereMap, again, sphere_map};
 use super::unfold::Corners;
 use super::untangle::Tangle;
 use super::zero::{OnZero, project};
-use super::{Effort, ShrinkError, ShrinkSpec, Wrap};
+use super::{Distortion, Effort, ShrinkError, ShrinkSpec, Wrap};
 use crate::field::Sampler;
 use crate::settings::{Canceled, Front, Progress, Settings};
 use glam::DVec3;
@@ -97,20 +97,24 @@ fn one(
     let sampler = scene.framed(frame);
     let mesh = base(front, (attempt.fineness * base_vertices(lattice)) as usize, &sampler)?;
     stage("map", 0.45, Some(show(&mesh.positions, mesh.rings.triangles())), None, None);
-    let mut density = density(&mesh, spec.density, &settings);
+    let mut sampling = Sampling::new(&mesh, spec.density, &settings);
+    if spec.distortion == Distortion::Angle {
+        // a stretched surface has other angles
+        sampling.stretch = Sampling::even(mesh.positions.len()).stretch;
+    }
     let wanting: Vec<DVec3> = places.iter().map(|&p| frame.from_scene(p)).collect();
-    denser_at(&mesh, &wanting, &mut density);
+    denser_at(&mesh, &wanting, &mut sampling.density);
     let objective = spec.distortion.objective();
-    let mut map = sphere_map(&mesh, &density, objective, &settings)?.ok_or(ShrinkError::Unmapped)?;
+    let mut map = sphere_map(&mesh, &sampling, objective, &settings)?.ok_or(ShrinkError::Unmapped)?;
     stage("resample", 0.75, None, Some(map.energy), None);
     let mut landing = Landing::new(&mesh, &map, lattice, &settings)?;
     for round in 1..=DENSER {
         let base = Base { mesh: &mesh, directions: &landing.directions };
         let missed = missed(&base, lattice, &landing.positions, settings.cancel)?;
-        if !denser(&mesh, &missed, attempt.missed, &mut density) {
+        if !denser(&mesh, &missed, attempt.missed, &mut sampling.density) {
             break;
         }
-        map = again(&mesh, map, &density, objective, &settings)?;
+        map = again(&mesh, map, &sampling, objective, &settings)?;
         stage("resample", 0.75 + 0.02 * round as f32, None, Some(map.energy), None);
         landing = Landing::new(&mesh, &map, lattice, &settings)?;
     }

@@ -177,6 +177,10 @@ pub(super) fn keeps_shape(
     })
 }
 
+/// A quad's triangles with its first diagonal, and with the other.
+const FIRST: [[usize; 3]; 2] = [[0, 1, 2], [0, 2, 3]];
+const OTHER: [[usize; 3]; 2] = [[0, 1, 3], [1, 2, 3]];
+
 /// Chooses the diagonals of the quads that have a corner for which `changed` holds: the one that runs closer to the zero
 /// level set where the normals around differ, the one that agrees with them elsewhere.
 pub fn choose_diagonals(
@@ -186,7 +190,7 @@ pub fn choose_diagonals(
     choice: &mut [bool],
     changed: impl Fn(usize) -> bool,
 ) -> Result<(), Canceled> {
-    /// Quads whose normals agree at least this well keep the regular pattern.
+    /// Of quads whose normals agree at least this well the field is not asked.
     const EVEN: f64 = 0.97;
     let normals: Vec<DVec3> = at.gradients.iter().map(|g| g.normalize_or_zero()).collect();
     let (mut asked, mut middles) = (Vec::new(), Vec::new());
@@ -196,11 +200,19 @@ pub fn choose_diagonals(
             continue;
         }
         choice[i] = false;
+        if !lattice.free[i] {
+            continue;
+        }
         let mean = k.iter().map(|&v| normals[v]).sum::<DVec3>().normalize_or_zero();
         let p = k.map(|v| at.positions[v]);
         let flat = k.iter().all(|&v| normals[v].dot(mean) > EVEN);
         let first = unit_normal([p[0], p[1], p[2]]).dot(mean).min(unit_normal([p[0], p[2], p[3]]).dot(mean));
-        if lattice.free[i] && !(flat && first > 0.9) {
+        if flat && first > 0.9 {
+            let wrong = |t: [[usize; 3]; 2]| -> f64 {
+                t.iter().map(|c| deviation(c.map(|j| p[j]), c.map(|j| normals[k[j]]))).sum()
+            };
+            choice[i] = wrong(OTHER) < wrong(FIRST);
+        } else {
             asked.push(i);
             middles.extend([p[0].midpoint(p[2]), p[1].midpoint(p[3])]);
         }
@@ -220,9 +232,15 @@ pub fn choose_diagonals(
                 .fold(f64::INFINITY, f64::min);
             value.abs() / size + (0.3 - least).max(0.0)
         };
-        let first = cost([[0, 1, 2], [0, 2, 3]], values[2 * n]);
-        let other = cost([[0, 1, 3], [1, 2, 3]], values[2 * n + 1]);
+        let first = cost(FIRST, values[2 * n]);
+        let other = cost(OTHER, values[2 * n + 1]);
         choice[i] = other < first - 1e-3;
     }
     Ok(())
+}
+
+/// How far a triangle's normal is from those of its corners: twice its area times one less their product.
+fn deviation([a, b, c]: [DVec3; 3], normals: [DVec3; 3]) -> f64 {
+    let normal = (b - a).cross(c - a);
+    normal.length() - normal.dot(normals.iter().sum::<DVec3>().normalize_or_zero())
 }

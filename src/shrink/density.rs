@@ -1,61 +1,115 @@
-//! How densely the surface is to be sampled: evenly by area, more where it is curved, or more where the solid or the space
-//! beside it is thin, so that tips and limbs keep their shape.
+//! How the surface is to be sampled: evenly by area, more where it is curved and there more across the curvature than along
+//! it, or more where the solid or the space beside it is thin, so that tips and limbs keep their shape.
 
 use super::Density;
+use super::energy::{add_outer, larger_axis, tangents};
 use super::points::Points;
 use super::rings::Mesh;
 use crate::settings::Settings;
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 use rayon::prelude::*;
+use std::ops::{Add, Mul};
 
 /// Largest density over the smallest.
-const RANGE: f64 = 3.0;
+const RANGE: f64 = 2.0;
 /// Curvature, in units of the sphere of equal area, from which on more samples are asked for.
 const CALM: f64 = 2.0;
-/// Density grows with this power of the curvature, or of one over the reach.
-const POWER: f64 = 0.5;
+/// Largest ratio of the lengths that a sample stands for along and across the curvature.
+const ELONGATION: f64 = 2.0;
 /// Rounds of averaging over neighbours, so that the map is not asked for jumps.
 const ROUNDS: usize = 4;
 
-/// The density at every vertex, from 1 to [`RANGE`].
-pub fn density(mesh: &Mesh, kind: Density, settings: &Settings<'_>) -> Vec<f64> {
-    let n = mesh.positions.len() as u32;
-    let normals: Vec<DVec3> = (0..n).map(|v| mesh.vertex_normal(v)).collect();
-    let unit = (mesh.area() / (4.0 * std::f64::consts::PI)).sqrt();
-    let narrowness = match kind {
-        Density::Area => return vec![1.0; n as usize],
-        Density::Curvature => curvature(mesh, &normals),
-        Density::Reach => reach(mesh, &normals, unit / CALM, settings).into_iter().map(|r| 1.0 / r).collect(),
-    };
-    let mut density: Vec<f64> =
-        narrowness.into_iter().map(|k| (k * unit / CALM).powf(POWER).clamp(1.0, RANGE)).collect();
+/// How the surface is to be sampled, at every vertex.
+pub struct Sampling {
+    /// Samples per area, up to a common factor.
+    pub density: Vec<f64>,
+    /// What edges are multiplied by before they are mapped: symmetric matrices that keep areas in the tangent plane and
+    /// lengthen what turns the normal. The sum of squares of what normals change by from sample to sample is least where
+    /// samples are apart as one over the curvature (normals as the signal of Sander et al. 2002, "Signal-specialized
+    /// parametrization").
+    pub stretch: Vec<DMat3>,
+}
+
+impl Sampling {
+    /// By area alone.
+    pub fn even(vertices: usize) -> Self {
+        Self { density: vec![1.0; vertices], stretch: vec![DMat3::IDENTITY; vertices] }
+    }
+
+    /// With a density from 1 to [`RANGE`].
+    pub fn new(mesh: &Mesh, kind: Density, settings: &Settings<'_>) -> Self {
+        let n = mesh.positions.len();
+        let normals: Vec<DVec3> = (0..n as u32).map(|v| mesh.vertex_normal(v)).collect();
+        let unit = (mesh.area() / (4.0 * std::f64::consts::PI)).sqrt();
+        let rise = |narrowness: f64| (narrowness * unit / CALM).clamp(1.0, RANGE);
+        match kind {
+            Density::Area => Self::even(n),
+            Density::Curvature => {
+                let turns = turns(mesh, &normals);
+                let density = turns.iter().map(|turn| rise((0.5 * trace(turn)).sqrt())).collect();
+                let turns = averaged(mesh, turns).into_iter().map(|turn| turn * (unit * unit));
+                let stretch = normals.iter().zip(turns).map(|(&normal, turn)| stretch(normal, &turn)).collect();
+                Self { density: averaged(mesh, density), stretch }
+            }
+            Density::Reach => {
+                let reach = reach(mesh, &normals, unit / CALM, settings);
+                let density = reach.into_iter().map(|radius| rise(1.0 / radius)).collect();
+                Self { density: averaged(mesh, density), ..Self::even(n) }
+            }
+        }
+    }
+}
+
+/// Every vertex's mean with its ring, again and again.
+fn averaged<T: Copy + Add<Output = T> + Mul<f64, Output = T>>(mesh: &Mesh, mut values: Vec<T>) -> Vec<T> {
     for _ in 0..ROUNDS {
-        density = (0..n)
+        values = (0..values.len())
             .map(|v| {
-                let ring = mesh.rings.ring(v);
-                let around: f64 = ring.iter().map(|&u| density[u as usize]).sum();
-                0.5 * (density[v as usize] + around / ring.len() as f64)
+                let ring = mesh.rings.ring(v as u32);
+                let rest = ring[1..].iter().fold(values[ring[0] as usize], |sum, &u| sum + values[u as usize]);
+                (values[v] + rest * (1.0 / ring.len() as f64)) * 0.5
             })
             .collect();
     }
-    density
+    values
 }
 
-/// Root mean square of the normal curvatures along a vertex's edges.
-fn curvature(mesh: &Mesh, normals: &[DVec3]) -> Vec<f64> {
-    (0..mesh.positions.len() as u32)
+/// The square of the shape operator at every vertex, as a matrix in space: its eigenvalues are the squared principal
+/// curvatures, from how normals change along the edges.
+fn turns(mesh: &Mesh, normals: &[DVec3]) -> Vec<DMat3> {
+    (0..normals.len())
         .map(|v| {
-            let ring = mesh.rings.ring(v);
-            let squared: f64 = ring
-                .iter()
-                .map(|&u| {
-                    let turn = normals[u as usize].distance_squared(normals[v as usize]);
-                    turn / mesh.positions[u as usize].distance_squared(mesh.positions[v as usize]).max(1e-30)
-                })
-                .sum();
-            (squared / ring.len() as f64).sqrt()
+            let (mut sum, mut squared) = (DMat3::ZERO, 0.0);
+            for &u in mesh.rings.ring(v as u32) {
+                let turn = normals[u as usize] - normals[v];
+                add_outer(&mut sum, turn, turn, 1.0);
+                squared += mesh.positions[u as usize].distance_squared(mesh.positions[v]);
+            }
+            // edges in all directions alike have half of their squares along each axis of the plane
+            sum * (2.0 / squared.max(1e-30))
         })
         .collect()
+}
+
+fn trace(m: &DMat3) -> f64 {
+    m.x_axis.x + m.y_axis.y + m.z_axis.z
+}
+
+/// The matrix of [`Sampling::stretch`] for squared curvatures in units of the sphere of equal area.
+fn stretch(normal: DVec3, turn: &DMat3) -> DMat3 {
+    let (e1, e2) = tangents(normal);
+    let (a, b, c) = (e1.dot(*turn * e1), e1.dot(*turn * e2), e2.dot(*turn * e2));
+    let (mean, radius) = (0.5 * (a + c), (0.25 * (a - c) * (a - c) + b * b).sqrt());
+    let (large, small) = (mean + radius, (mean - radius).max(0.0));
+    let axis = larger_axis(a, b, c, large);
+    let along = axis.x * e1 + axis.y * e2;
+    // what is as flat as the sphere of equal area has no direction
+    let side = ((1.0 + large) / (1.0 + small)).sqrt().min(ELONGATION).sqrt();
+    let mut m = DMat3::ZERO;
+    add_outer(&mut m, along, along, side);
+    add_outer(&mut m, normal.cross(along), normal.cross(along), 1.0 / side);
+    add_outer(&mut m, normal, normal, 1.0);
+    m
 }
 
 /// Radius, at most `largest`, of the largest ball that touches the surface at every vertex from either side and holds no
@@ -123,7 +177,7 @@ mod tests {
     fn made(mesh: &Mesh, kind: Density) -> Vec<f64> {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
         let cancel = CancelToken::new();
-        density(mesh, kind, &Settings { pool: &pool, cancel: &cancel, progress: &|_: Progress| {} })
+        Sampling::new(mesh, kind, &Settings { pool: &pool, cancel: &cancel, progress: &|_: Progress| {} }).density
     }
 
     fn nearest(mesh: &Mesh, q: DVec3) -> usize {
@@ -141,7 +195,43 @@ mod tests {
         assert_eq!(by_curvature[middle], 1.0);
         assert!(by_curvature[rim] > 1.5, "{}", by_curvature[rim]);
         let by_reach = made(&plate, Density::Reach);
-        assert!(by_reach[middle] > 2.0, "{}", by_reach[middle]);
+        assert!(by_reach[middle] > 1.9, "{}", by_reach[middle]);
+    }
+
+    #[test]
+    fn edges_around_a_limb_are_lengthened_edges_along_it_shortened_and_areas_kept() {
+        // a rod of radius 0.1 along z
+        let (rows, columns) = (60, 24);
+        let at = |row: usize, column: usize| {
+            let angle = 2.0 * std::f64::consts::PI * column as f64 / columns as f64;
+            DVec3::new(0.1 * angle.cos(), 0.1 * angle.sin(), 2.0 * row as f64 / rows as f64 - 1.0)
+        };
+        let mut positions: Vec<DVec3> = (0..=rows).flat_map(|r| (0..columns).map(move |c| at(r, c))).collect();
+        let poles = [positions.len() as u32, positions.len() as u32 + 1];
+        positions.extend([-1.0, 1.0].map(|z| DVec3::Z * z));
+        let number = |row: usize, column: usize| (row * columns + column % columns) as u32;
+        let mut triangles = Vec::new();
+        for c in 0..columns {
+            triangles.push([poles[0], number(0, c + 1), number(0, c)]);
+            triangles.push([poles[1], number(rows, c), number(rows, c + 1)]);
+            for r in 0..rows {
+                let quad = [number(r, c), number(r, c + 1), number(r + 1, c + 1), number(r + 1, c)];
+                triangles.extend([[quad[0], quad[1], quad[2]], [quad[0], quad[2], quad[3]]]);
+            }
+        }
+        let rings = Rings::new(positions.len(), &triangles).expect("a closed mesh");
+        let rod = Mesh { positions, rings };
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+        let cancel = CancelToken::new();
+        let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_: Progress| {} };
+        let middle = number(rows / 2, 0) as usize;
+        let stretch = Sampling::new(&rod, Density::Curvature, &settings).stretch[middle];
+        let side = ELONGATION.sqrt();
+        for (edge, expected) in [(DVec3::Y, side), (DVec3::Z, 1.0 / side), (DVec3::X, 1.0)] {
+            let found = stretch * edge;
+            assert!(found.distance(expected * edge) < 0.01, "{edge} became {found}");
+        }
+        assert_eq!(Sampling::new(&rod, Density::Area, &settings).stretch[middle], DMat3::IDENTITY);
     }
 
     #[test]

@@ -61,9 +61,10 @@ impl Reference {
 }
 
 /// What a map is to keep, per area of a reference triangle, with T the Dirichlet energy per area and D the ratio of areas:
-/// `isometry` T (1 + D^-2) / 4 + `area` (D + 1/D) / 2 + `angle` T / (2 D). Each term is 1 for an isometry and infinite where
+/// `isometry` T (1 + D^-2) / 4 + `area` (D^2 + 2/D) / 3 + `angle` T / (2 D). Each term is 1 for an isometry and infinite where
 /// a triangle loses its area. The first is a quarter of the symmetric Dirichlet energy (Smith and Schaefer 2015,
-/// "Bijective parameterization with free boundaries"), the last is MIPS (Hormann and Greiner 2000).
+/// "Bijective parameterization with free boundaries"), the last is MIPS (Hormann and Greiner 2000). The second is steeper
+/// where a triangle gets too much than where it gets too little: what crowds in a limb's tip is missed everywhere else.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Objective {
     /// Weight of lengths.
@@ -94,9 +95,9 @@ impl super::Distortion {
     /// limb's tip less of the sphere than a lattice can sample.
     pub fn objective(self) -> Objective {
         match self {
-            Self::Area => Objective { isometry: 0.5, area: 8.0, angle: 0.0 },
+            Self::Area => Objective { isometry: 0.5, area: 4.0, angle: 0.0 },
             Self::Angle => Objective { isometry: 0.1, area: 0.0, angle: 1.0 },
-            Self::Isometric => Objective { isometry: 1.0, area: 2.0, angle: 0.0 },
+            Self::Isometric => Objective { isometry: 1.0, area: 1.5, angle: 0.5 },
         }
     }
 }
@@ -106,7 +107,7 @@ impl Objective {
     pub fn value(&self, t: f64, d: f64) -> f64 {
         let inverse = 1.0 / d;
         0.25 * self.isometry * t * (1.0 + inverse * inverse)
-            + 0.5 * self.area * (d + inverse)
+            + self.area * (d * d + 2.0 * inverse) / 3.0
             + 0.5 * self.angle * t * inverse
     }
     /// Energy per area and its derivatives.
@@ -114,11 +115,13 @@ impl Objective {
         let i1 = 1.0 / d;
         let (i2, i3) = (i1 * i1, i1 * i1 * i1);
         Derivatives {
-            value: 0.25 * self.isometry * t * (1.0 + i2) + 0.5 * self.area * (d + i1) + 0.5 * self.angle * t * i1,
+            value: 0.25 * self.isometry * t * (1.0 + i2)
+                + self.area * (d * d + 2.0 * i1) / 3.0
+                + 0.5 * self.angle * t * i1,
             by_t: 0.25 * self.isometry * (1.0 + i2) + 0.5 * self.angle * i1,
-            by_d: -0.5 * self.isometry * t * i3 + 0.5 * self.area * (1.0 - i2) - 0.5 * self.angle * t * i2,
+            by_d: -0.5 * self.isometry * t * i3 + self.area * (d - i2) * (2.0 / 3.0) - 0.5 * self.angle * t * i2,
             by_td: -0.5 * self.isometry * i3 - 0.5 * self.angle * i2,
-            by_dd: 1.5 * self.isometry * t * i2 * i2 + self.area * i3 + self.angle * t * i3,
+            by_dd: 1.5 * self.isometry * t * i2 * i2 + self.area * (2.0 + 4.0 * i3) / 3.0 + self.angle * t * i3,
         }
     }
     /// The value at an isometry: the sum of the weights.

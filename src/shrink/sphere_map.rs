@@ -12,6 +12,7 @@ mod level;
 pub(super) mod newton;
 mod star;
 
+use super::density::Sampling;
 use super::energy::{Objective, Reference};
 use super::rings::{Mesh, Rings};
 use crate::settings::{CancelToken, Canceled, Settings};
@@ -60,34 +61,33 @@ pub struct SphereMap {
     pub energy: f64,
 }
 
-/// Maps `mesh` to the sphere; every spherical triangle is positively oriented. `density` is the share of the sphere per area
-/// that every vertex asks for, up to a common factor. `None` when the mesh cannot be decimated to a tetrahedron or an
+/// Maps `mesh` to the sphere, for its surface to be sampled as `sampling` says; every spherical triangle is positively
+/// oriented. `None` when the mesh cannot be decimated to a tetrahedron or an
 /// insertion finds no kernel.
 pub fn sphere_map(
     mesh: &Mesh,
-    density: &[f64],
+    sampling: &Sampling,
     objective: Objective,
     settings: &Settings<'_>,
 ) -> Result<Option<SphereMap>, Canceled> {
     // one visit to the pool: its threads stay awake between the many short parallel loops
-    let result = settings.pool.install(|| map_and_descent(mesh, density, objective, settings))?;
+    let result = settings.pool.install(|| map_and_descent(mesh, sampling, objective, settings))?;
     Ok(result.map(|(map, _)| map))
 }
 
-/// The map for another `density`, from one of the same mesh that is there.
+/// The map for another `sampling`, from one of the same mesh that is there.
 pub fn again(
     mesh: &Mesh,
     map: SphereMap,
-    density: &[f64],
+    sampling: &Sampling,
     objective: Objective,
     settings: &Settings<'_>,
 ) -> Result<SphereMap, Canceled> {
     settings.pool.install(|| {
         let mut map = Inserter {
-            positions: &mesh.positions,
             directions: map.directions,
             rings: mesh.rings.clone(),
-            scales: scales(mesh, density),
+            shapes: Shapes::new(mesh, sampling),
             objective,
             star: Star::default(),
         };
@@ -99,7 +99,7 @@ pub fn again(
 /// The map, and how its last descent went.
 fn map_and_descent(
     mesh: &Mesh,
-    density: &[f64],
+    sampling: &Sampling,
     objective: Objective,
     settings: &Settings<'_>,
 ) -> Result<Option<(SphereMap, Descent)>, Canceled> {
@@ -109,10 +109,9 @@ fn map_and_descent(
     };
     let n = mesh.positions.len();
     let mut map = Inserter {
-        positions: &mesh.positions,
         directions: vec![DVec3::ZERO; n],
         rings,
-        scales: scales(mesh, density),
+        shapes: Shapes::new(mesh, sampling),
         objective,
         star: Star::default(),
     };
@@ -146,18 +145,6 @@ fn map_and_descent(
     map.finish(&mut active, settings).map(Some)
 }
 
-/// Squared lengths on the sphere per squared length on the mesh that are asked for at every vertex, so that the whole mesh
-/// asks for the whole sphere.
-fn scales(mesh: &Mesh, density: &[f64]) -> Vec<f64> {
-    let weighted: f64 = mesh
-        .rings
-        .triangles()
-        .into_iter()
-        .map(|t| 0.5 * mesh.normal(t).length() * t.iter().map(|&v| density[v as usize]).sum::<f64>() / 3.0)
-        .sum();
-    density.iter().map(|d| d * 4.0 * PI / weighted).collect()
-}
-
 /// Sweeps until the energy falls slowly, at most six times as often as asked.
 fn sweep(
     level: &Level,
@@ -178,19 +165,47 @@ fn sweep(
 
 /// The map while vertices come back.
 struct Inserter<'a> {
-    positions: &'a [DVec3],
+    shapes: Shapes<'a>,
     directions: Vec<DVec3>,
     rings: Rings,
-    /// Squared lengths on the sphere per squared length on the mesh, at every vertex.
-    scales: Vec<f64>,
     objective: Objective,
     star: Star,
 }
 
-/// The reference triangle of three vertices: as on the mesh, at the size that their density asks for.
-fn reference(positions: &[DVec3], scales: &[f64], t: [u32; 3]) -> Reference {
-    let scale = t.iter().map(|&v| scales[v as usize]).sum::<f64>() / 3.0;
-    Reference::new(t.map(|v| positions[v as usize]), scale.sqrt(), SOFTENING)
+/// What the triangles of the mesh are to look like on the sphere.
+struct Shapes<'a> {
+    positions: &'a [DVec3],
+    sampling: &'a Sampling,
+    /// Squared lengths on the sphere per squared length on the mesh and density, so that the whole mesh asks for the whole
+    /// sphere.
+    scale: f64,
+}
+
+impl<'a> Shapes<'a> {
+    fn new(mesh: &'a Mesh, sampling: &'a Sampling) -> Self {
+        let shapes = Self { positions: &mesh.positions, sampling, scale: 1.0 };
+        let area = |t: [u32; 3]| {
+            let [a, b, c] = shapes.stretched(t);
+            0.5 * (b - a).cross(c - a).length() * shapes.density(t)
+        };
+        let whole: f64 = mesh.rings.triangles().into_iter().map(area).sum();
+        Self { scale: 4.0 * PI / whole, ..shapes }
+    }
+
+    fn density(&self, t: [u32; 3]) -> f64 {
+        t.iter().map(|&v| self.sampling.density[v as usize]).sum::<f64>() / 3.0
+    }
+
+    /// The corners of a triangle, stretched as its vertices ask for on average.
+    fn stretched(&self, t: [u32; 3]) -> [DVec3; 3] {
+        let [a, b, c] = t.map(|v| self.sampling.stretch[v as usize]);
+        let mean = (a + b + c) * (1.0 / 3.0);
+        t.map(|v| mean * self.positions[v as usize])
+    }
+
+    fn reference(&self, t: [u32; 3]) -> Reference {
+        Reference::new(self.stretched(t), (self.scale * self.density(t)).sqrt(), SOFTENING)
+    }
 }
 
 impl Inserter<'_> {
@@ -198,9 +213,8 @@ impl Inserter<'_> {
     fn level(&self, active: &mut [u32], settings: &Settings<'_>) -> (Level, Vec<DVec3>) {
         active.sort_unstable();
         let places = active.iter().map(|&v| self.directions[v as usize]).collect();
-        let reference = |t| reference(self.positions, &self.scales, t);
         let ring = |v| self.rings.ring(v);
-        (Level::new(active.to_vec(), self.positions.len(), ring, reference, settings), places)
+        (Level::new(active.to_vec(), self.directions.len(), ring, |t| self.shapes.reference(t), settings), places)
     }
 
     /// The map with all vertices in place brought to its minimum, and how that went.
@@ -225,7 +239,7 @@ impl Inserter<'_> {
         let ring = self.rings.ring(v);
         for (i, &b) in ring.iter().enumerate() {
             let c = ring[(i + 1) % ring.len()];
-            let reference = reference(self.positions, &self.scales, [v, b, c]);
+            let reference = self.shapes.reference([v, b, c]);
             self.star.push(self.directions[b as usize], self.directions[c as usize], &reference);
         }
     }
@@ -394,7 +408,7 @@ mod tests {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let cancel = CancelToken::new();
         let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_: Progress| {} };
-        map_and_descent(mesh, &vec![1.0; mesh.positions.len()], objective, &settings).unwrap().expect("a map")
+        map_and_descent(mesh, &Sampling::even(mesh.positions.len()), objective, &settings).unwrap().expect("a map")
     }
 
     fn bijective(mesh: &Mesh, map: &SphereMap) {
@@ -445,10 +459,11 @@ mod tests {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
         let cancel = CancelToken::new();
         let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_: Progress| {} };
-        let scales = scales(&mesh, &vec![1.0; mesh.positions.len()]);
+        let sampling = Sampling::even(mesh.positions.len());
+        let shapes = Shapes::new(&mesh, &sampling);
         let vertices: Vec<u32> = (0..mesh.positions.len() as u32).collect();
-        let reference = |t| reference(&mesh.positions, &scales, t);
-        let level = Level::new(vertices, mesh.positions.len(), |v| mesh.rings.ring(v), reference, &settings);
+        let level =
+            Level::new(vertices, mesh.positions.len(), |v| mesh.rings.ring(v), |t| shapes.reference(t), &settings);
         // the direction from inside the limb's foot is a bijection, and a bad one
         let mut places: Vec<DVec3> = mesh.positions.iter().map(|p| (*p - 0.5 * DVec3::Z).normalize()).collect();
         let mut last = level.energy(&places, &ISOMETRIC, &settings);
