@@ -93,7 +93,7 @@ impl ShrinkSpec {
 pub enum Density {
     /// Evenly by area.
     Area,
-    /// More where the surface is curved.
+    /// More where the surface is curved, and closer together across the curvature than along it.
     #[default]
     Curvature,
     /// More where the solid or the space beside it is thin.
