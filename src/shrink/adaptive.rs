@@ -27,14 +27,34 @@ struct Attempt {
     /// Share of the base's diagonal that the lattice may miss the base by before more of the sphere is asked for there: in
     /// the first attempt a little more than half of what a result may miss, because the field still has to be met.
     missed: f64,
+    /// Factor on the weight of areas: where all else failed, limbs that are left thinly sampled are better than twisted ones.
+    area: f64,
     /// Where its share of the progress starts and ends.
     share: (f32, f32),
 }
 
 const ATTEMPTS: [Attempt; 3] = [
-    Attempt { resolution: Resolution { levels: 3, local: 0 }, fineness: 1.0, missed: 0.0055, share: (0.0, 0.7) },
-    Attempt { resolution: Resolution { levels: 3, local: 2 }, fineness: 2.0, missed: 0.003, share: (0.7, 0.9) },
-    Attempt { resolution: Resolution { levels: 4, local: 1 }, fineness: 2.0, missed: 0.0015, share: (0.9, 1.0) },
+    Attempt {
+        resolution: Resolution { levels: 3, local: 0 },
+        fineness: 1.0,
+        missed: 0.0055,
+        area: 1.0,
+        share: (0.0, 0.7),
+    },
+    Attempt {
+        resolution: Resolution { levels: 3, local: 2 },
+        fineness: 2.0,
+        missed: 0.003,
+        area: 1.0,
+        share: (0.7, 0.9),
+    },
+    Attempt {
+        resolution: Resolution { levels: 4, local: 1 },
+        fineness: 2.0,
+        missed: 0.0015,
+        area: 0.5,
+        share: (0.9, 1.0),
+    },
 ];
 
 /// Rounds of asking for more of the sphere where the lattice misses the base.
@@ -104,7 +124,8 @@ fn one(
     }
     let wanting: Vec<DVec3> = places.iter().map(|&p| frame.from_scene(p)).collect();
     denser_at(&mesh, &wanting, &mut sampling.density);
-    let objective = spec.distortion.objective();
+    let mut objective = spec.distortion.objective();
+    objective.area *= attempt.area;
     let mut map = sphere_map(&mesh, &sampling, objective, &settings)?.ok_or(ShrinkError::Unmapped)?;
     stage("resample", 0.75, None, Some(map.energy), None);
     let mut landing = Landing::new(&mesh, &map, lattice, &settings)?;
