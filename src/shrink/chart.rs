@@ -63,7 +63,7 @@ pub fn relax(
     distortion: Distortion,
     settings: &Settings<'_>,
 ) -> Result<Vec<[f64; 2]>, Canceled> {
-    let Some((chart, mut places)) = Chart::new(lattice, triangles, positions, distortion.objective()) else {
+    let Some((chart, mut places)) = Chart::new(lattice, triangles, positions, distortion.chart_objective()) else {
         return Ok(lattice.uv.clone());
     };
     // one visit to the pool: its threads stay awake between the many short parallel loops

@@ -38,7 +38,8 @@ impl Case {
     /// Energy per area of the chart with these places.
     fn energy(&self, uv: &[[f64; 2]], distortion: Distortion) -> f64 {
         let lattice = SphereLattice { uv: uv.to_vec(), ..self.lattice.clone() };
-        let (chart, places) = Chart::new(&lattice, &self.triangles, &self.positions, distortion.objective()).unwrap();
+        let (chart, places) =
+            Chart::new(&lattice, &self.triangles, &self.positions, distortion.chart_objective()).unwrap();
         let real = &chart.pieces[..self.triangles.len()];
         let sum: f64 = real.iter().map(|piece| piece.energy(&places, &chart.objective)).sum();
         sum / real.iter().map(|piece| piece.weight).sum::<f64>()
@@ -53,7 +54,7 @@ fn the_energy_falls_and_every_triangle_stays_positive_in_single_precision() {
         let case = Case::new(spec);
         let uv = case.relaxed(distortion, 2);
         let (before, after) = (case.energy(&case.lattice.uv, distortion), case.energy(&uv, distortion));
-        let ideal = distortion.objective().ideal();
+        let ideal = distortion.chart_objective().ideal();
         println!("{spec:?} {distortion:?}: {before:.3} -> {after:.3}, ideal {ideal}");
         // the poles of a lat-long chart keep a whole side each, which leaves less to gain
         let left = if matches!(spec, LatticeSpec::Latlong { .. }) { 0.95 } else { 0.8 };
@@ -94,7 +95,7 @@ fn what_is_on_the_border_slides_along_its_side_and_the_cut_stays_where_it_is() {
 fn the_gaps_between_the_teeth_are_filled_so_that_the_border_is_the_square() {
     let case = Case::new(SPECS[0]);
     let (chart, places) =
-        Chart::new(&case.lattice, &case.triangles, &case.positions, Distortion::Isometric.objective()).unwrap();
+        Chart::new(&case.lattice, &case.triangles, &case.positions, Distortion::Isometric.chart_objective()).unwrap();
     let area: f64 = chart.pieces.iter().map(|p| p.jacobian(p.places(&places)).1 * p.area).sum();
     assert!((area - 2.0).abs() < 1e-6, "the whole rectangle is covered: {area}");
     let around: f64 = chart.border.iter().map(|(_, along)| along.length()).sum();
@@ -114,7 +115,7 @@ fn the_gradient_is_that_of_finite_differences() {
     let case = Case::new(SPECS[0]);
     for distortion in [Distortion::Isometric, Distortion::Angle, Distortion::Area] {
         let (chart, places) =
-            Chart::new(&case.lattice, &case.triangles, &case.positions, distortion.objective()).unwrap();
+            Chart::new(&case.lattice, &case.triangles, &case.positions, distortion.chart_objective()).unwrap();
         for piece in chart.pieces.iter().step_by(97) {
             let (slope, _) = derivatives(piece, &places, &chart);
             for (i, &v) in piece.corners.iter().enumerate() {
