@@ -62,8 +62,7 @@ pub struct SphereMap {
 }
 
 /// Maps `mesh` to the sphere, for its surface to be sampled as `sampling` says; every spherical triangle is positively
-/// oriented. `None` when the mesh cannot be decimated to a tetrahedron or an
-/// insertion finds no kernel.
+/// oriented. `None` when the mesh cannot be decimated to a tetrahedron or an insertion finds no kernel.
 pub fn sphere_map(
     mesh: &Mesh,
     sampling: &Sampling,
