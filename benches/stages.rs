@@ -119,7 +119,7 @@ fn attempt(
     let cancel = CancelToken::new();
     let settings = Settings { pool, cancel: &cancel, progress: &progress };
     let tally = Tally::new();
-    shrink(&Sampler::new(field, settings, &tally), spec, &Effort::default()).map_err(|e| e.to_string())?;
+    shrink(&Sampler::new(field, settings, &tally), spec, None, &Effort::default()).map_err(|e| e.to_string())?;
     let mut marks = marks.into_inner().unwrap();
     marks.push(("", now()));
     Ok(marks.windows(2).map(|m| (m[0].0, m[1].1.map(m[0].1, |end, start| end - start))).collect())

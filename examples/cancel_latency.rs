@@ -21,7 +21,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let run = |cancel: &CancelToken| {
             let settings = Settings { pool: &pool, cancel, progress: &|_| {} };
             let tally = Tally::new();
-            shrink(&Sampler::new(field.as_ref(), settings, &tally), &ShrinkSpec::default(), &Effort::default()).is_err()
+            shrink(&Sampler::new(field.as_ref(), settings, &tally), &ShrinkSpec::default(), None, &Effort::default())
+                .is_err()
         };
         let clock = Instant::now();
         run(&CancelToken::new());

@@ -97,6 +97,9 @@ pub struct ExtractArgs {
     /// How the samples are spread over the surface
     #[arg(long, value_enum, default_value_t = DensityArg::Curvature)]
     pub density: DensityArg,
+    /// A field whose values say how closely samples are spaced where: in proportion, instead of --density
+    #[arg(long, value_name = "FIELD", conflicts_with = "density")]
+    pub weight: Option<PathBuf>,
     /// What the sphere map keeps best
     #[arg(long, value_enum, default_value_t = DistortionArg::Isometric)]
     pub distortion: DistortionArg,

@@ -74,13 +74,14 @@ const REPAIRS: u32 = 2;
 /// Share of an attempt's time that shrinking takes; measuring takes the rest.
 const SHRINKING: f32 = 0.8;
 
-/// Makes a certified surface of the sampler's field, or the best there is.
+/// Makes a certified surface of the sampler's field, or the best there is. `weight` is what [`shrink`] takes.
 ///
 /// # Errors
 /// [`ShrinkError`] when the token was raised, or when no attempt gave a surface.
 pub fn extract(
     sampler: &Sampler<'_>,
     spec: &ShrinkSpec,
+    weight: Option<&dyn Field>,
     budget: Budget,
     begins: &dyn Fn(Part),
 ) -> Result<Extracted, ShrinkError> {
@@ -114,7 +115,7 @@ pub fn extract(
         let progress = |progress: Progress| told.tell(attempt, start, measured_from, progress);
         let settings = Settings { progress: &progress, ..told.settings };
         let field = field_of(sampler, mended.as_ref());
-        let wrap = match shrink(&Sampler::new(field, settings, sampler.tally()), spec, &effort) {
+        let wrap = match shrink(&Sampler::new(field, settings, sampler.tally()), spec, weight, &effort) {
             Ok(wrap) => wrap,
             // a handle that the first look missed; plugs that a finer look finds may close it
             Err(error @ (ShrinkError::Genus { .. } | ShrinkError::Components { .. }))
@@ -303,7 +304,7 @@ mod tests {
             let tally = Tally::new();
             let settings = Settings { progress: &progress, ..*settings };
             let sampler = Sampler::new(field, settings, &tally);
-            let made = extract(&sampler, spec, budget, &|part| parts.lock().expect("no panic").push(part));
+            let made = extract(&sampler, spec, None, budget, &|part| parts.lock().expect("no panic").push(part));
             let (news, parts) = (news.lock().expect("no panic").clone(), parts.lock().expect("no panic").clone());
             (made, news, parts, tally.total().total())
         })
@@ -364,7 +365,7 @@ mod tests {
                         cancel.cancel();
                     }
                 };
-                let made = extract(&Sampler::new(&field, settings, &tally), &spec, Budget::default(), &begins);
+                let made = extract(&Sampler::new(&field, settings, &tally), &spec, None, Budget::default(), &begins);
                 assert!(matches!(made, Err(ShrinkError::Canceled(_))), "stopped at part {stop_at}");
             });
         }

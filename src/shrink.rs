@@ -34,7 +34,7 @@ mod unfold;
 mod untangle;
 mod zero;
 
-use crate::field::Sampler;
+use crate::field::{Field, Sampler};
 use crate::settings::Canceled;
 use glam::DVec3;
 use lattice::{LatticeSpec, SphereLattice};
@@ -98,6 +98,8 @@ pub enum Density {
     Curvature,
     /// More where the solid or the space beside it is thin.
     Reach,
+    /// In proportion to the weight, a field of its own that is given beside this.
+    Weight,
 }
 
 /// What the sphere map keeps best.
@@ -250,6 +252,9 @@ pub enum ShrinkError {
         /// Scene positions, one inside each; at most 16.
         places: Vec<[f64; 3]>,
     },
+    /// The density asks for a weight, and there is none on the surface.
+    #[error("the weight is positive nowhere on the surface, so it says nothing about where samples should be")]
+    NoWeight,
     /// The base surface could not be mapped to the sphere.
     #[error("the surface could not be mapped to the sphere without folding")]
     Unmapped,
@@ -272,6 +277,7 @@ impl ShrinkError {
             ShrinkError::Components { .. } => "components",
             ShrinkError::NoComponent { .. } => "no_such_component",
             ShrinkError::Genus { .. } | ShrinkError::Holes { .. } => "genus",
+            ShrinkError::NoWeight => "no_weight",
             ShrinkError::Unmapped => "unmapped",
             ShrinkError::Dimension { .. } => "dimension",
         }
@@ -288,16 +294,22 @@ impl ShrinkError {
     }
 }
 
-/// Contracts a sphere onto the zero level set of the sampler's field.
+/// Contracts a sphere onto the zero level set of the sampler's field. `weight`, in scene units, is what
+/// [`Density::Weight`] goes by.
 ///
 /// # Errors
 /// [`ShrinkError`] when the run was canceled, or when the zero level set is empty, in several pieces or has handles.
-pub fn shrink(sampler: &Sampler<'_>, spec: &ShrinkSpec, effort: &Effort) -> Result<Wrap, ShrinkError> {
+pub fn shrink(
+    sampler: &Sampler<'_>,
+    spec: &ShrinkSpec,
+    weight: Option<&dyn Field>,
+    effort: &Effort,
+) -> Result<Wrap, ShrinkError> {
     if sampler.field().dimension() != 3 {
         return Err(ShrinkError::Dimension { found: sampler.field().dimension(), wanted: 3 });
     }
     match spec.method {
-        Method::Adaptive => adaptive::run(sampler, spec, effort),
+        Method::Adaptive => adaptive::run(sampler, spec, weight, effort),
         Method::Paper => paper::run(sampler, spec),
     }
 }

@@ -2,12 +2,12 @@
 
 use super::{BAD_INPUT, BAD_USAGE, ExtractArgs, FAILED, NOT_WRAPPED, fail};
 use crate::extract::Budget;
-use crate::job::failure::Ended;
-use crate::job::pipeline::{self, Asked, CurveMade, Made};
+use crate::job::failure::{Ended, Failure};
+use crate::job::pipeline::{self, Asked, CurveMade, Made, Opened};
 use crate::job::spec::{FieldSpec, OutputName};
 use crate::measure::verdict::Finding;
 use crate::settings::{CancelToken, Progress, Settings};
-use crate::shrink::ShrinkSpec;
+use crate::shrink::{Density, ShrinkSpec};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -30,13 +30,12 @@ pub fn run(args: &ExtractArgs) -> ExitCode {
 /// An exit code and what to say, where there is no result that passed its checks.
 fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
     let clock = Instant::now();
-    let bytes = std::fs::read(&args.field).map_err(|e| (BAD_INPUT, format!("{}: {e}", args.field.display())))?;
     let spec = FieldSpec { options: args.field_options.read()?, ..FieldSpec::default() };
     let in_field = |detail: &str| format!("{}: {detail}", args.field.display());
-    let opened = pipeline::open(&spec, Some(&bytes), "").map_err(|failure| {
-        let places: String = failure.errors.iter().map(|e| format!("\n  {}: {}", e.pointer, e.detail)).collect();
-        (BAD_INPUT, in_field(&format!("{}{places}", failure.detail)))
-    })?;
+    let mut opened = open(&args.field, |bytes| pipeline::open(&spec, Some(bytes), ""))?;
+    if let Some(path) = &args.weight {
+        opened = open(path, |bytes| opened.with_weight(&FieldSpec::default(), Some(bytes), ""))?;
+    }
     let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads).build();
     let pool = pool.map_err(|e| (FAILED, e.to_string()))?;
     let (cancel, bar) = (CancelToken::new(), progress_bar());
@@ -51,7 +50,7 @@ fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
     let shrink = ShrinkSpec {
         method: args.method.into(),
         lattice: args.lattice,
-        density: args.density.into(),
+        density: if args.weight.is_some() { Density::Weight } else { args.density.into() },
         distortion: args.distortion.into(),
         relax_uv: args.relax_uv,
         on_topology: args.on_topology.into(),
@@ -113,6 +112,15 @@ fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
         n => format!("{n} attempts"),
     };
     Err((code, in_field(&format!("the best surface of {attempts} was written, and it did not pass:{faults}"))))
+}
+
+/// Reads a file and opens it; what is wrong is said with the file's name.
+fn open(path: &Path, with: impl FnOnce(&[u8]) -> Result<Opened, Box<Failure>>) -> Result<Opened, (u8, String)> {
+    let bytes = std::fs::read(path).map_err(|e| (BAD_INPUT, format!("{}: {e}", path.display())))?;
+    with(&bytes).map_err(|failure| {
+        let places: String = failure.errors.iter().map(|e| format!("\n  {}: {}", e.pointer, e.detail)).collect();
+        (BAD_INPUT, format!("{}: {}{places}", path.display(), failure.detail))
+    })
 }
 
 /// A finding in one line: its sentence, its code, and where.

@@ -4,6 +4,7 @@ use super::{App, Problem, body, conditional, inputs, query};
 use crate::blobs::BlobId;
 use crate::engine::{Forgotten, IdempotencyKey, NewJob, Submitted};
 use crate::field::{Fault, FieldError};
+use crate::job::spec::FieldSpec;
 use crate::job::{Failure, Job, JobId, JobSpec, pipeline};
 use crate::shrink::Method;
 use axum::Json;
@@ -79,7 +80,7 @@ pub async fn submit(
     // the keys of a JSON value are sorted, so that spaces and order do not make another request
     let fingerprint = BlobId::of(request.to_string().as_bytes()).hex();
     let spec = JobSpec::from_value(&request).map_err(|faults| Problem::invalid_request("", &faults))?;
-    let (spec, dimension) = check_field(&app, spec).await?;
+    let dimension = check_fields(&app, &spec).await?;
     let spec = spec.for_dimension(dimension, &request).map_err(|faults| Problem::invalid_request("", &faults))?;
     if validate_only {
         return Ok(Json(estimate(&spec, dimension)).into_response());
@@ -276,32 +277,40 @@ fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, Problem> {
     }
 }
 
-/// Checks what the field names: the scene in the request, or the input that must be there. Tells its dimension.
-async fn check_field(app: &App, spec: JobSpec) -> Result<(JobSpec, u8), Problem> {
-    if let Some(id) = spec.field.input {
+/// Checks what the field and the weight name. Tells the field's dimension.
+async fn check_fields(app: &App, spec: &JobSpec) -> Result<u8, Problem> {
+    let dimension = check_field(app, &spec.field, "/field").await?;
+    if let Some(weight) = &spec.weight
+        && check_field(app, weight, "/weight").await? != 3
+    {
+        let detail = "a weight is a field of dimension 3".to_owned();
+        let fault = Fault { pointer: "/weight".to_owned(), code: "dimension", detail };
+        return Err(Problem::invalid_request("", &[fault]));
+    }
+    Ok(dimension)
+}
+
+/// Checks what a field names, at `pointer`: the scene in the request, or the input that must be there. Tells its dimension.
+async fn check_field(app: &App, field: &FieldSpec, pointer: &'static str) -> Result<u8, Problem> {
+    if let Some(id) = field.input {
         let Some(note) = app.blobs.note(id).await? else {
             let detail = format!("no input {id} is stored; upload it to /v1/inputs first");
-            let fault = Fault { pointer: "/field/input".to_owned(), code: "unknown_input", detail };
+            let fault = Fault { pointer: format!("{pointer}/input"), code: "unknown_input", detail };
             return Err(Problem::invalid_request("", &[fault]));
         };
-        let dimension = inputs::read_note(&note)?.dimension();
-        return Ok((spec, dimension));
+        return Ok(inputs::read_note(&note)?.dimension());
     }
+    let Some(scene) = field.scene.clone() else { return Ok(3) };
     // a scene may be large: checked off the runtime
-    let (spec, checked) = tokio::task::spawn_blocking(move || {
-        let checked = spec.field.scene.as_ref().map_or(Ok(3), pipeline::check_scene);
-        (spec, checked)
-    })
-    .await
-    .map_err(|error| {
+    let checked = tokio::task::spawn_blocking(move || pipeline::check_scene(&scene)).await.map_err(|error| {
         tracing::error!(%error, "a scene could not be checked");
         Problem::internal()
     })?;
-    match checked {
-        Ok(dimension) => Ok((spec, dimension)),
-        Err(FieldError::Invalid { faults }) => Err(Problem::invalid_request("/field/scene", &faults)),
-        Err(error) => Err(Failure::from_field(&error, "/field/scene").into()),
-    }
+    let pointer = format!("{pointer}/scene");
+    checked.map_err(|error| match error {
+        FieldError::Invalid { faults } => Problem::invalid_request(&pointer, &faults),
+        error => Failure::from_field(&error, &pointer).into(),
+    })
 }
 
 fn estimate(spec: &JobSpec, dimension: u8) -> Estimate {
@@ -339,7 +348,10 @@ pub struct JobRequest {
     #[schema(required = false)]
     kind: crate::job::JobKind,
     /// The field.
-    field: crate::job::spec::FieldSpec,
+    field: FieldSpec,
+    /// What samples are spread by, where the density is `weight`: its values, which need not be distances.
+    #[schema(required = false)]
+    weight: Option<FieldSpec>,
     /// How it is shrunk.
     #[schema(required = false)]
     shrink: crate::shrink::ShrinkSpec,

@@ -87,6 +87,7 @@ impl Failure {
                 | "over_limit"
                 | "unsupported_input"
                 | "unknown_input"
+                | "no_weight"
         )
     }
 
@@ -148,6 +149,7 @@ impl Failure {
             ShrinkError::NoComponent { .. } => "there is no such component",
             ShrinkError::Genus { .. } => "the zero level set has handles",
             ShrinkError::Holes { .. } => "the solid in the plane has holes",
+            ShrinkError::NoWeight => "the weight is positive nowhere on the surface",
             ShrinkError::Unmapped => "the surface could not be mapped to the sphere",
             ShrinkError::Dimension { .. } => "the field has the wrong dimension for this",
         };

@@ -31,7 +31,9 @@ const PREVIEW_WIDTH: u32 = 1024;
 pub struct Opened {
     /// The field.
     pub field: Box<dyn Field>,
-    /// The hash and the size of its bytes, and the options; written into the GLB.
+    /// What `density: weight` goes by, if it was given.
+    pub weight: Option<Box<dyn Field>>,
+    /// The hash and the size of the field's bytes, and the options; written into the GLB.
     pub provenance: Value,
 }
 
@@ -139,7 +141,21 @@ pub fn open(spec: &FieldSpec, bytes: Option<&[u8]>, at: &str) -> Result<Opened, 
     let field = input::open(bytes, &spec.options).map_err(|e| Failure::from_field(&e, at))?;
     // the bytes of a scene in a request are its JSON without spaces, members in alphabetical order
     let provenance = json!({"sha256": BlobId::of(bytes).hex(), "bytes": bytes.len(), "options": spec.options});
-    Ok(Opened { field, provenance })
+    Ok(Opened { field, weight: None, provenance })
+}
+
+impl Opened {
+    /// The same with a weight, opened like a field and pointed to below `at`.
+    pub fn with_weight(mut self, spec: &FieldSpec, bytes: Option<&[u8]>, at: &str) -> Result<Self, Box<Failure>> {
+        let opened = open(spec, bytes, at)?;
+        let found = opened.field.dimension();
+        if found != 3 || self.field.dimension() != 3 {
+            return Err(Box::new(Failure::from_shrink(&ShrinkError::Dimension { found, wanted: 3 })));
+        }
+        self.weight = Some(opened.field);
+        self.provenance["weight"] = opened.provenance;
+        Ok(self)
+    }
 }
 
 /// Seconds that the parts of an extraction took.
@@ -174,7 +190,7 @@ pub fn make(opened: &Opened, asked: &Asked<'_>, settings: Settings<'_>) -> Resul
     let tally = Tally::new();
     let sampler = Sampler::new(opened.field.as_ref(), Settings { progress: &told, ..settings }, &tally);
     let clock = Clock::default();
-    let made = extract(&sampler, asked.shrink, asked.budget, &|part| clock.begin(Some(part)));
+    let made = extract(&sampler, asked.shrink, opened.weight.as_deref(), asked.budget, &|part| clock.begin(Some(part)));
     clock.begin(None);
     let Extracted { surface, mut report, refusal } = made?;
     report.seconds.load = asked.load_seconds;

@@ -114,6 +114,10 @@ pub struct JobSpec {
     pub kind: super::JobKind,
     /// The field.
     pub field: FieldSpec,
+    /// What samples are spread by, where the density is `weight`: its values, which need not be distances.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(required = false)]
+    pub weight: Option<FieldSpec>,
     /// How it is shrunk.
     pub shrink: ShrinkSpec,
     /// What may be spent on it.
@@ -141,6 +145,14 @@ impl JobSpec {
     /// says nothing gets is completed. `request` is what the spec was read from.
     pub fn for_dimension(mut self, dimension: u8, request: &Value) -> Result<Self, Vec<Fault>> {
         if dimension == 2 {
+            if self.weight.is_some() {
+                let detail = "samples of a curve are spread by arc length, not by a weight";
+                return Err(vec![Fault {
+                    pointer: "/weight".to_owned(),
+                    code: "dimension",
+                    detail: detail.to_owned(),
+                }]);
+            }
             if request.get("outputs").is_none() {
                 self.outputs.push(OutputName::Svg);
                 self.outputs.sort_unstable();
@@ -248,12 +260,13 @@ fn read_spec(value: &Value, faults: &mut Faults) -> JobSpec {
     let mut spec = JobSpec {
         kind: super::JobKind::Shrink,
         field: FieldSpec::default(),
+        weight: None,
         shrink: ShrinkSpec::default(),
         budget: Budget::default(),
         outputs: vec![OutputName::Glb, OutputName::Preview, OutputName::Report],
         labels: BTreeMap::new(),
     };
-    let known = ["kind", "field", "shrink", "budget", "outputs", "labels"];
+    let known = ["kind", "field", "weight", "shrink", "budget", "outputs", "labels"];
     let Some(object) = faults.object(value, "", &known) else { return spec };
     if let Some(kind) = object.get("kind").and_then(|kind| faults.string(kind, "/kind"))
         && kind != "shrink"
@@ -261,11 +274,24 @@ fn read_spec(value: &Value, faults: &mut Faults) -> JobSpec {
         faults.add("/kind", "unknown_value", format!("unknown kind {kind:?}; known: shrink"));
     }
     match object.get("field") {
-        Some(field) => spec.field = read_field(field, faults),
+        Some(field) => spec.field = read_field(field, "/field", faults),
         None => faults.add("/field", "missing_member", "a job needs a field"),
     }
     if let Some(shrink) = object.get("shrink") {
         spec.shrink = read_shrink(shrink, faults);
+    }
+    if let Some(weight) = object.get("weight") {
+        spec.weight = Some(read_field(weight, "/weight", faults));
+        if object.get("shrink").and_then(|shrink| shrink.get("density")).is_none() {
+            spec.shrink.density = Density::Weight;
+        }
+    }
+    match (&spec.weight, spec.shrink.density) {
+        (None, Density::Weight) => faults.add("/weight", "missing_member", "density weight needs a weight, a field"),
+        (Some(_), density) if density != Density::Weight => {
+            faults.add("/shrink/density", "ambiguous", "a weight is given, so the density is weight");
+        }
+        _ => {}
     }
     if let Some(budget) = object.get("budget") {
         spec.budget = read_budget(budget, faults);
@@ -279,35 +305,36 @@ fn read_spec(value: &Value, faults: &mut Faults) -> JobSpec {
     spec
 }
 
-fn read_field(value: &Value, faults: &mut Faults) -> FieldSpec {
+/// Reads a field, or a weight, at `pointer`.
+fn read_field(value: &Value, pointer: &str, faults: &mut Faults) -> FieldSpec {
     let mut field = FieldSpec::default();
     let known = ["scene", "input", "latent", "latent_row", "transform", "domain", "level", "activation"];
-    let Some(object) = faults.object(value, "/field", &known) else { return field };
+    let Some(object) = faults.object(value, pointer, &known) else { return field };
     match (object.get("scene"), object.get("input")) {
         (Some(scene), None) => field.scene = Some(scene.clone()),
         (None, Some(input)) => {
-            if let Some(name) = faults.string(input, "/field/input") {
+            if let Some(name) = faults.string(input, &format!("{pointer}/input")) {
                 field.input = name.parse().ok();
                 if field.input.is_none() {
                     let detail = "expected sha256: and 64 lower-case hexadecimal digits";
-                    faults.add("/field/input", "invalid_id", detail);
+                    faults.add(format!("{pointer}/input"), "invalid_id", detail);
                 }
             }
         }
-        (Some(_), Some(_)) => faults.add("/field", "ambiguous", "give scene or input, not both"),
-        (None, None) => faults.add("/field", "missing_member", "give scene or input"),
+        (Some(_), Some(_)) => faults.add(pointer, "ambiguous", "give scene or input, not both"),
+        (None, None) => faults.add(pointer, "missing_member", "give scene or input"),
     }
     field.options = FieldOptions {
-        latent: object.get("latent").and_then(|latent| read_latent(latent, faults)),
-        latent_row: object.get("latent_row").and_then(|row| faults.count(row, "/field/latent_row")),
-        transform: option(object, "transform", "scale, rotate {axis [3], angle}, translate [3]", faults),
-        domain: option(object, "domain", "\"fit\" or {\"min\": [x, y, z], \"max\": [x, y, z]}", faults),
-        level: object.get("level").and_then(|level| faults.number(level, "/field/level")),
-        activation: option(object, "activation", "the name of an activation", faults),
+        latent: object.get("latent").and_then(|latent| read_latent(latent, &format!("{pointer}/latent"), faults)),
+        latent_row: object.get("latent_row").and_then(|row| faults.count(row, &format!("{pointer}/latent_row"))),
+        transform: option(object, pointer, "transform", "scale, rotate {axis [3], angle}, translate [3]", faults),
+        domain: option(object, pointer, "domain", "\"fit\" or {\"min\": [x, y, z], \"max\": [x, y, z]}", faults),
+        level: object.get("level").and_then(|level| faults.number(level, &format!("{pointer}/level"))),
+        activation: option(object, pointer, "activation", "the name of an activation", faults),
     };
     // what an option may be is known in the field's room
     if let Err(FieldError::Invalid { faults: wrong }) = field.options.check() {
-        faults.0.extend(wrong.into_iter().map(|f| Fault { pointer: format!("/field{}", f.pointer), ..f }));
+        faults.0.extend(wrong.into_iter().map(|f| Fault { pointer: format!("{pointer}{}", f.pointer), ..f }));
     }
     field
 }
@@ -315,6 +342,7 @@ fn read_field(value: &Value, faults: &mut Faults) -> FieldSpec {
 /// A member that its own type reads.
 fn option<T: serde::de::DeserializeOwned>(
     object: &Map<String, Value>,
+    pointer: &str,
     name: &str,
     expected: &str,
     faults: &mut Faults,
@@ -323,22 +351,22 @@ fn option<T: serde::de::DeserializeOwned>(
     match T::deserialize(value) {
         Ok(read) => Some(read),
         Err(error) => {
-            faults.add(format!("/field/{name}"), "invalid_value", format!("expected {expected}: {error}"));
+            faults.add(format!("{pointer}/{name}"), "invalid_value", format!("expected {expected}: {error}"));
             None
         }
     }
 }
 
-fn read_latent(value: &Value, faults: &mut Faults) -> Option<Vec<f32>> {
+fn read_latent(value: &Value, pointer: &str, faults: &mut Faults) -> Option<Vec<f32>> {
     let Some(list) = value.as_array() else {
-        faults.add("/field/latent", "wrong_type", format!("expected a list of numbers, found {}", type_name(value)));
+        faults.add(pointer, "wrong_type", format!("expected a list of numbers, found {}", type_name(value)));
         return None;
     };
     if list.len() > MAX_LATENT {
-        faults.add("/field/latent", "too_many", format!("{} numbers, and at most {MAX_LATENT} are read", list.len()));
+        faults.add(pointer, "too_many", format!("{} numbers, and at most {MAX_LATENT} are read", list.len()));
         return None;
     }
-    let numbers = list.iter().enumerate().map(|(i, n)| faults.number(n, &format!("/field/latent/{i}")));
+    let numbers = list.iter().enumerate().map(|(i, n)| faults.number(n, &format!("{pointer}/{i}")));
     // a plain collect would stop at the first fault
     let numbers: Vec<Option<f32>> = numbers.collect();
     numbers.into_iter().collect()
@@ -350,7 +378,7 @@ fn read_shrink(value: &Value, faults: &mut Faults) -> ShrinkSpec {
     let Some(object) = faults.object(value, "/shrink", &known) else { return shrink };
     use {Density as D, Distortion as K, Method as M, OnTopology as T};
     let methods = [("adaptive", M::Adaptive), ("paper", M::Paper)];
-    let densities = [("area", D::Area), ("curvature", D::Curvature), ("reach", D::Reach)];
+    let densities = [("area", D::Area), ("curvature", D::Curvature), ("reach", D::Reach), ("weight", D::Weight)];
     let distortions = [("area", K::Area), ("angle", K::Angle), ("isometric", K::Isometric)];
     let topologies = [("refuse", T::Refuse), ("wrap", T::Wrap)];
     choose(object, "method", &methods, &mut shrink.method, faults);
@@ -629,6 +657,23 @@ mod tests {
             ("/labels/x", "wrong_type"),
         ];
         assert_eq!(found, expected.map(|(p, c)| (p.to_owned(), c)));
+    }
+
+    #[test]
+    fn a_weight_is_read_like_a_field_and_makes_the_density() {
+        let weight = json!({"input": format!("sha256:{}", "ab".repeat(32)), "level": 0.5});
+        let spec = JobSpec::from_value(&json!({"field": {"scene": {}}, "weight": weight})).expect("good");
+        assert_eq!(spec.shrink.density, Density::Weight);
+        let stored = serde_json::to_value(&spec).expect("serializes");
+        assert_eq!((&stored["weight"]["level"], JobSpec::from_value(&stored)), (&json!(0.5), Ok(spec)));
+        let other = json!({"field": {"scene": {}}, "weight": weight, "shrink": {"density": "area"}});
+        assert_eq!(faults(other), [("/shrink/density".to_owned(), "ambiguous")]);
+        let none = json!({"field": {"scene": {}}, "shrink": {"density": "weight"}});
+        assert_eq!(faults(none), [("/weight".to_owned(), "missing_member")]);
+        let odd =
+            json!({"field": {"scene": {}}, "weight": {"scene": {}, "levle": 1, "latent": [1, "x"], "domain": "large"}});
+        let places = ["/weight/levle", "/weight/latent/1", "/weight/domain"];
+        assert_eq!(faults(odd).into_iter().map(|f| f.0).collect::<Vec<_>>(), places);
     }
 
     #[test]

@@ -6,10 +6,11 @@
 use super::failure::{Ended, Failure};
 use super::preview::MeshPreview;
 use super::{EventKind, Output, OutputName, ProgressView};
-use crate::blobs::{BlobError, Blobs};
+use crate::blobs::{BlobError, BlobId, Blobs};
 use crate::engine::{Claim, Engine, EngineError, Outcome, Renewal, Update};
 use crate::job::pipeline::{self, Asked};
 use crate::settings::{CancelToken, Progress, Settings};
+use bytes::Bytes;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
@@ -171,24 +172,15 @@ impl Worker {
         let (blobs, pool) = (self.blobs.clone(), self.pool.clone());
         async move {
             let clock = Instant::now();
-            let input = match claim.spec.field.input {
-                None => None,
-                Some(id) => match blobs.get(id).await {
-                    Ok(bytes) => Some(bytes),
-                    Err(BlobError::Missing) => {
-                        let detail = format!("no input {id} is stored");
-                        return Err(Failure::new("unknown_input", "the input is not there", detail).into());
-                    }
-                    Err(error) => {
-                        tracing::error!(%error, "the input could not be read");
-                        return Err(Failure::internal().into());
-                    }
-                },
-            };
+            let input = read_input(&blobs, claim.spec.field.input).await?;
+            let weight = read_input(&blobs, claim.spec.weight.as_ref().and_then(|weight| weight.input)).await?;
             let span = tracing::Span::current();
             let compute = move || {
                 let _entered = span.enter();
-                let opened = pipeline::open(&claim.spec.field, input.as_deref(), "/field")?;
+                let mut opened = pipeline::open(&claim.spec.field, input.as_deref(), "/field")?;
+                if let Some(spec) = &claim.spec.weight {
+                    opened = opened.with_weight(spec, weight.as_deref(), "/weight")?;
+                }
                 cancel.check()?;
                 let teller = Teller::new(news);
                 let progress = |progress: Progress| teller.tell(progress);
@@ -259,6 +251,22 @@ impl Worker {
                     tokio::time::sleep(BACKOFF).await;
                 }
             }
+        }
+    }
+}
+
+/// The bytes of an input that a job names, if it names one.
+async fn read_input(blobs: &Blobs, id: Option<BlobId>) -> Result<Option<Bytes>, Failure> {
+    let Some(id) = id else { return Ok(None) };
+    match blobs.get(id).await {
+        Ok(bytes) => Ok(Some(bytes)),
+        Err(BlobError::Missing) => {
+            let detail = format!("no input {id} is stored");
+            Err(Failure::new("unknown_input", "the input is not there", detail))
+        }
+        Err(error) => {
+            tracing::error!(%error, "the input could not be read");
+            Err(Failure::internal())
         }
     }
 }

@@ -14,8 +14,8 @@ use super::sphere_map::{SphereMap, again, sphere_map};
 use super::unfold::Corners;
 use super::untangle::Tangle;
 use super::zero::{OnZero, project};
-use super::{Distortion, Effort, ShrinkError, ShrinkSpec, Wrap};
-use crate::field::Sampler;
+use super::{Density, Distortion, Effort, ShrinkError, ShrinkSpec, Wrap};
+use crate::field::{Field, Sampler};
 use crate::settings::{Canceled, Front, Progress, Settings};
 use glam::DVec3;
 
@@ -72,12 +72,17 @@ fn base_vertices(lattice: &SphereLattice) -> f64 {
 }
 
 /// Makes one attempt; a refusal that a finer lattice could see differently is looked at by the later ones.
-pub fn run(sampler: &Sampler<'_>, spec: &ShrinkSpec, effort: &Effort) -> Result<Wrap, ShrinkError> {
+pub fn run(
+    sampler: &Sampler<'_>,
+    spec: &ShrinkSpec,
+    weight: Option<&dyn Field>,
+    effort: &Effort,
+) -> Result<Wrap, ShrinkError> {
     let lattice = SphereLattice::new(spec.lattice);
     let first = (effort.attempt as usize).min(ATTEMPTS.len() - 1);
     let mut refusal = None;
     for attempt in &ATTEMPTS[first..] {
-        match one(sampler, spec, &lattice, attempt, &effort.places) {
+        match one(sampler, spec, weight, &lattice, attempt, &effort.places) {
             Ok(wrap) => return Ok(wrap),
             Err(refused) if !refused.certain => refusal = Some(refused.error),
             Err(refused) => return Err(refused.error),
@@ -89,6 +94,7 @@ pub fn run(sampler: &Sampler<'_>, spec: &ShrinkSpec, effort: &Effort) -> Result<
 fn one(
     scene: &Sampler<'_>,
     spec: &ShrinkSpec,
+    weight: Option<&dyn Field>,
     lattice: &SphereLattice,
     attempt: &Attempt,
     places: &[DVec3],
@@ -117,7 +123,15 @@ fn one(
     let sampler = scene.framed(frame);
     let mesh = base(front, (attempt.fineness * base_vertices(lattice)) as usize, &sampler)?;
     stage("map", 0.45, Some(show(&mesh.positions, mesh.rings.triangles())), None, None);
-    let mut sampling = Sampling::new(&mesh, spec.density, &settings);
+    let mut sampling = match spec.density {
+        Density::Weight => {
+            let weight = weight.ok_or(ShrinkError::NoWeight)?;
+            let places = mesh.positions.iter().map(|&p| frame.to_scene(p));
+            Sampling::weighted(&mesh, places, &Sampler::new(weight, settings, scene.tally()))?
+                .ok_or(ShrinkError::NoWeight)?
+        }
+        kind => Sampling::new(&mesh, kind, &settings),
+    };
     if spec.distortion == Distortion::Angle {
         // a stretched surface has other angles
         sampling.stretch = Sampling::even(mesh.positions.len()).stretch;

@@ -5,7 +5,8 @@ use super::Density;
 use super::energy::{add_outer, larger_axis, tangents};
 use super::points::Points;
 use super::rings::Mesh;
-use crate::settings::Settings;
+use crate::field::{Domain, Sampler};
+use crate::settings::{Canceled, Settings};
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 use std::ops::{Add, Mul};
@@ -16,6 +17,8 @@ const RANGE: f64 = 2.0;
 const CALM: f64 = 2.0;
 /// Largest ratio of the lengths that a sample stands for along and across the curvature.
 const ELONGATION: f64 = 2.0;
+/// Largest weight over the smallest that is heeded: with less than this share of the samples nothing keeps its shape.
+const WEIGHTS: f64 = 16.0;
 /// Rounds of averaging over neighbours, so that the map is not asked for jumps.
 const ROUNDS: usize = 4;
 
@@ -43,7 +46,7 @@ impl Sampling {
         let unit = (mesh.area() / (4.0 * std::f64::consts::PI)).sqrt();
         let rise = |narrowness: f64| (narrowness * unit / CALM).clamp(1.0, RANGE);
         match kind {
-            Density::Area => Self::even(n),
+            Density::Area | Density::Weight => Self::even(n),
             Density::Curvature => {
                 let turns = turns(mesh, &normals);
                 let density = turns.iter().map(|turn| rise((0.5 * trace(turn)).sqrt())).collect();
@@ -57,6 +60,27 @@ impl Sampling {
                 Self { density: averaged(mesh, density), ..Self::even(n) }
             }
         }
+    }
+}
+
+impl Sampling {
+    /// In proportion to a weight, whose values are taken at the vertices' `places` in its scene or, outside its domain, at the
+    /// nearest place of that. What is below a 16th of the largest value counts as that. `None` when no value is
+    /// positive.
+    pub fn weighted(
+        mesh: &Mesh,
+        places: impl Iterator<Item = DVec3>,
+        weight: &Sampler<'_>,
+    ) -> Result<Option<Self>, Canceled> {
+        let Domain { min, max } = weight.domain();
+        let places: Vec<DVec3> = places.map(|p| p.clamp(min.into(), max.into())).collect();
+        let values = weight.values(&places)?;
+        let largest = values.iter().copied().fold(0.0, f64::max);
+        if largest <= 0.0 {
+            return Ok(None);
+        }
+        let density = values.into_iter().map(|value| value.max(largest / WEIGHTS)).collect();
+        Ok(Some(Self { density: averaged(mesh, density), ..Self::even(mesh.positions.len()) }))
     }
 }
 

@@ -14,3 +14,4 @@ mod metrics;
 mod refusals;
 mod relaxed;
 mod walk;
+mod weight;

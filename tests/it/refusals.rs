@@ -47,6 +47,21 @@ async fn every_fault_of_a_request_is_named_by_its_place() {
             "out_of_range",
         ),
         (json!({"field": {"scene": {"sphere": {"radius": 0.5}}}, "outputs": ["stl"]}), "/outputs/0", "unknown_value"),
+        (
+            json!({"field": {"scene": {"sphere": {"radius": 0.5}}}, "weight": {"input": format!("sha256:{}", "0".repeat(64))}}),
+            "/weight/input",
+            "unknown_input",
+        ),
+        (
+            json!({"field": {"scene": {"sphere": {"radius": 0.5}}}, "weight": {"scene": {"circle": {"radius": 0.5}}}}),
+            "/weight",
+            "dimension",
+        ),
+        (
+            json!({"field": {"scene": {"circle": {"radius": 0.5}}}, "weight": {"scene": {"sphere": {"radius": 0.5}}}}),
+            "/weight",
+            "dimension",
+        ),
     ];
     for (body, pointer, code) in cases {
         let document = problem(app.post("/v1/jobs", &body).await, 422, "invalid_request").await;
