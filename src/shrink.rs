@@ -6,6 +6,7 @@
 
 mod adaptive;
 mod base;
+mod cells;
 pub mod chart;
 mod collide;
 mod complex;

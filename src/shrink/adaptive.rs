@@ -1,16 +1,17 @@
 //! `method: adaptive`: contract, remesh, map, resample, untangle; again and finer where the result is folded.
 
 use super::base::base;
+use super::cells;
 use super::contract::{Refusal, Resolution, contract};
 use super::creases::{choose_diagonals, snap};
 use super::denser::{denser, denser_at};
 use super::density::Sampling;
-use super::lattice::SphereLattice;
+use super::lattice::{LatticeSpec, SphereLattice};
 use super::reclaim::{Base, missed, reclaim};
 use super::resample::{land, orient};
 use super::rings::Mesh;
 use super::separate::separate;
-use super::sphere_map::{SphereMap, again, sphere_map};
+use super::sphere_map::{SphereMap, settled, sphere_map};
 use super::unfold::Corners;
 use super::untangle::Tangle;
 use super::zero::{OnZero, project};
@@ -27,6 +28,12 @@ struct Attempt {
     /// Share of the base's diagonal that the lattice may miss the base by before more of the sphere is asked for there: in
     /// the first attempt a little more than half of what a result may miss, because the field still has to be met.
     missed: f64,
+    /// Rounds of asking for more of the sphere there,
+    denser: usize,
+    /// and by how much at most in each.
+    rise: f64,
+    /// Factor on the density around the places where the attempt before went wrong.
+    insist: f64,
     /// Factor on the weight of areas: where all else failed, limbs that are left thinly sampled are better than twisted ones.
     area: f64,
     /// Where its share of the progress starts and ends.
@@ -38,6 +45,9 @@ const ATTEMPTS: [Attempt; 3] = [
         resolution: Resolution { levels: 3, local: 0 },
         fineness: 1.0,
         missed: 0.0055,
+        denser: 4,
+        rise: 2.0,
+        insist: 1.0,
         area: 1.0,
         share: (0.0, 0.7),
     },
@@ -45,6 +55,9 @@ const ATTEMPTS: [Attempt; 3] = [
         resolution: Resolution { levels: 3, local: 2 },
         fineness: 2.0,
         missed: 0.003,
+        denser: 6,
+        rise: 2.0,
+        insist: 1.2,
         area: 1.0,
         share: (0.7, 0.9),
     },
@@ -52,13 +65,13 @@ const ATTEMPTS: [Attempt; 3] = [
         resolution: Resolution { levels: 4, local: 1 },
         fineness: 2.0,
         missed: 0.0015,
+        denser: 6,
+        rise: 3.0,
+        insist: 3.0,
         area: 0.5,
         share: (0.9, 1.0),
     },
 ];
-
-/// Rounds of asking for more of the sphere where the lattice misses the base.
-const DENSER: usize = 4;
 
 /// Vertices of the base surface that a lattice is sampled from: half as many as the default lattice has, and more slowly
 /// growing than the lattice, because what is finer than the base the field itself says.
@@ -137,19 +150,33 @@ fn one(
         sampling.stretch = Sampling::even(mesh.positions.len()).stretch;
     }
     let wanting: Vec<DVec3> = places.iter().map(|&p| frame.from_scene(p)).collect();
-    denser_at(&mesh, &wanting, &mut sampling.density);
+    denser_at(&mesh, &wanting, attempt.insist, &mut sampling.density);
     let mut objective = spec.distortion.objective();
     objective.area *= attempt.area;
-    let mut map = sphere_map(&mesh, &sampling, objective, &settings)?.ok_or(ShrinkError::Unmapped)?;
-    stage("resample", 0.75, None, Some(map.energy), None);
+    let directions = sphere_map(&mesh, &sampling, objective, &settings)?.ok_or(ShrinkError::Unmapped)?;
+    let mut map = match (spec.lattice, spec.density) {
+        (LatticeSpec::Octahedral { .. }, Density::Curvature) if spec.distortion != Distortion::Angle => {
+            objective.area *= cells::AREA;
+            let across = sampling.stretch.clone();
+            let mut fitted = |directions: Vec<DVec3>| {
+                let fit = cells::fit(&mesh, &directions);
+                sampling.stretch = across.iter().zip(fit).map(|(across, fit)| fit * *across).collect();
+                settled(&mesh, directions, &sampling, objective, &settings)
+            };
+            // a map that has moved has other cells
+            let first = fitted(directions)?;
+            fitted(first.directions)?
+        }
+        _ => settled(&mesh, directions, &sampling, objective, &settings)?,
+    };
     let mut landing = Landing::new(&mesh, &map, lattice, &settings)?;
-    for round in 1..=DENSER {
+    for round in 1..=attempt.denser {
         let base = Base { mesh: &mesh, directions: &landing.directions };
         let missed = missed(&base, lattice, &landing.positions, settings.cancel)?;
-        if !denser(&mesh, &missed, attempt.missed, &mut sampling.density) {
+        if !denser(&mesh, &missed, attempt.missed, attempt.rise, &mut sampling.density) {
             break;
         }
-        map = again(&mesh, map, &sampling, objective, &settings)?;
+        map = settled(&mesh, map.directions, &sampling, objective, &settings)?;
         stage("resample", 0.75 + 0.02 * round as f32, None, Some(map.energy), None);
         landing = Landing::new(&mesh, &map, lattice, &settings)?;
     }

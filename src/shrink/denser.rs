@@ -4,8 +4,6 @@
 use super::rings::Mesh;
 use glam::DVec3;
 
-/// Density rises by at most this factor in a round.
-const RISE: f64 = 3.0;
 /// Largest density over the smallest.
 const RANGE: f64 = 40.0;
 /// Rings of neighbours that a rise is carried on to, falling to nothing: so far a limb's tip and its flanks are one feature.
@@ -21,20 +19,20 @@ fn diagonal(mesh: &Mesh) -> f64 {
     lo.distance(hi)
 }
 
-/// Raises `density` around the places where the surface before was found wanting, in the mesh's frame.
-pub fn denser_at(mesh: &Mesh, places: &[DVec3], density: &mut [f64]) {
+/// Raises `density` by `rise` around the places where the surface before was found wanting, in the mesh's frame.
+pub fn denser_at(mesh: &Mesh, places: &[DVec3], rise: f64, density: &mut [f64]) {
     let reach = AROUND * diagonal(mesh);
     let near = |p: &DVec3| places.iter().any(|q| q.distance(*p) < reach);
-    let missed: Vec<f64> = mesh.positions.iter().map(|p| if near(p) { RISE * reach } else { 0.0 }).collect();
-    denser(mesh, &missed, AROUND, density);
+    let missed: Vec<f64> = mesh.positions.iter().map(|p| if near(p) { rise * reach } else { 0.0 }).collect();
+    denser(mesh, &missed, AROUND, rise, density);
 }
 
-/// Raises `density` where the base is `missed` (a distance per vertex) by more than `share` of its diagonal. Returns whether
-/// that was anywhere.
-pub fn denser(mesh: &Mesh, missed: &[f64], share: f64, density: &mut [f64]) -> bool {
+/// Raises `density` where the base is `missed` (a distance per vertex) by more than `share` of its diagonal: in proportion, and
+/// at most by `most`. Returns whether that was anywhere.
+pub fn denser(mesh: &Mesh, missed: &[f64], share: f64, most: f64, density: &mut [f64]) -> bool {
     let limit = share * diagonal(mesh);
     // rises as logarithms, carried on by the larger of a vertex's own and a share of its neighbours'
-    let mut rise: Vec<f64> = missed.iter().map(|m| (m / limit).clamp(1.0, RISE).ln()).collect();
+    let mut rise: Vec<f64> = missed.iter().map(|m| (m / limit).clamp(1.0, most).ln()).collect();
     if rise.iter().all(|&r| r == 0.0) {
         return false;
     }
@@ -60,6 +58,8 @@ mod tests {
     use super::super::rings::Rings;
     use super::*;
 
+    const RISE: f64 = 3.0;
+
     fn sphere() -> Mesh {
         let lattice = SphereLattice::new(LatticeSpec::Octahedral { n: 12 });
         let triangles = lattice.triangles(&vec![false; lattice.quads.len()]);
@@ -78,20 +78,20 @@ mod tests {
         let mesh = sphere();
         let n = mesh.positions.len();
         let (mut density, mut missed) = (vec![1.0; n], vec![0.0; n]);
-        assert!(!denser(&mesh, &missed, 0.005, &mut density) && density.iter().all(|&d| d == 1.0));
+        assert!(!denser(&mesh, &missed, 0.005, RISE, &mut density) && density.iter().all(|&d| d == 1.0));
         missed[100] = 1.0;
-        assert!(denser(&mesh, &missed, 0.005, &mut density));
+        assert!(denser(&mesh, &missed, 0.005, RISE, &mut density));
         assert!((density[100] - RISE).abs() < 1e-9);
         let neighbour = density[mesh.rings.ring(100)[0] as usize];
         assert!(neighbour > 1.0 && neighbour < RISE, "{neighbour}");
         let far = (0..n).filter(|&v| mesh.positions[v].dot(mesh.positions[100]) < -0.5);
         assert!(far.into_iter().all(|v| density[v] == 1.0));
         let mut around = vec![1.0; n];
-        denser_at(&mesh, &[mesh.positions[100]], &mut around);
+        denser_at(&mesh, &[mesh.positions[100]], RISE, &mut around);
         assert!((around[100] - RISE).abs() < 1e-9);
         assert_eq!(around[far_from(&mesh)], 1.0);
         for _ in 0..10 {
-            denser(&mesh, &missed, 0.005, &mut density);
+            denser(&mesh, &missed, 0.005, RISE, &mut density);
         }
         assert_eq!(density[100], RANGE);
     }

@@ -85,7 +85,7 @@ impl Sampling {
 }
 
 /// Every vertex's mean with its ring, again and again.
-fn averaged<T: Copy + Add<Output = T> + Mul<f64, Output = T>>(mesh: &Mesh, mut values: Vec<T>) -> Vec<T> {
+pub fn averaged<T: Copy + Add<Output = T> + Mul<f64, Output = T>>(mesh: &Mesh, mut values: Vec<T>) -> Vec<T> {
     for _ in 0..ROUNDS {
         values = (0..values.len())
             .map(|v| {

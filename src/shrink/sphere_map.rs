@@ -46,13 +46,13 @@ const NEWTON: Steps = Steps { work: 10_000, fewest: 2, most: 40 };
 /// A descent at a growth. Far from the minimum a step that is known better is not a longer one: the barriers stop it.
 const COARSE: Effort = Effort { steps: 0, products: 40, tolerance: 1e-3 };
 /// The last descent.
-const FINE: Effort = Effort { steps: 8, products: 40, tolerance: 1e-4 };
+const FINE: Effort = Effort { steps: 24, products: 40, tolerance: 1e-4 };
 /// A new vertex whose energy per area is above this is in trouble, and a growing patch around it is relaxed.
 const TROUBLE: f64 = 100.0;
 /// A new vertex whose energy per area is below this many times the ideal leaves its ring as it is.
 const CALM: f64 = 2.0;
 
-/// The map, and what it cost.
+/// A map at its minimum.
 #[derive(Clone, Debug)]
 pub struct SphereMap {
     /// Unit direction of every vertex.
@@ -61,47 +61,56 @@ pub struct SphereMap {
     pub energy: f64,
 }
 
-/// Maps `mesh` to the sphere, for its surface to be sampled as `sampling` says; every spherical triangle is positively
-/// oriented. `None` when the mesh cannot be decimated to a tetrahedron or an insertion finds no kernel.
+/// Maps `mesh` to the sphere, for its surface to be sampled as `sampling` says: a unit direction for every vertex, every
+/// spherical triangle positively oriented, and not far from the minimum, which [`settled`] takes it to. `None` when the mesh cannot be
+/// decimated to a tetrahedron or an insertion finds no kernel.
 pub fn sphere_map(
     mesh: &Mesh,
     sampling: &Sampling,
     objective: Objective,
     settings: &Settings<'_>,
-) -> Result<Option<SphereMap>, Canceled> {
+) -> Result<Option<Vec<DVec3>>, Canceled> {
     // one visit to the pool: its threads stay awake between the many short parallel loops
-    let result = settings.pool.install(|| map_and_descent(mesh, sampling, objective, settings))?;
-    Ok(result.map(|(map, _)| map))
+    settings.pool.install(|| inserted(mesh, sampling, objective, settings))
 }
 
-/// The map for another `sampling`, from one of the same mesh that is there.
-pub fn again(
+/// The map that is at its minimum, from one of the same mesh, perhaps for another `sampling`.
+pub fn settled(
     mesh: &Mesh,
-    map: SphereMap,
+    directions: Vec<DVec3>,
     sampling: &Sampling,
     objective: Objective,
     settings: &Settings<'_>,
 ) -> Result<SphereMap, Canceled> {
-    settings.pool.install(|| {
-        let mut map = Inserter {
-            directions: map.directions,
-            rings: mesh.rings.clone(),
-            shapes: Shapes::new(mesh, sampling),
-            objective,
-            star: Star::default(),
-        };
-        let mut active: Vec<u32> = (0..mesh.positions.len() as u32).collect();
-        Ok(map.finish(&mut active, settings)?.0)
-    })
+    let (directions, descent) = settings.pool.install(|| descended(mesh, directions, sampling, objective, settings))?;
+    Ok(SphereMap { directions, energy: descent.energy / (4.0 * PI) })
 }
 
-/// The map, and how its last descent went.
-fn map_and_descent(
+/// All vertices brought to the minimum, and how that went.
+fn descended(
+    mesh: &Mesh,
+    directions: Vec<DVec3>,
+    sampling: &Sampling,
+    objective: Objective,
+    settings: &Settings<'_>,
+) -> Result<(Vec<DVec3>, Descent), Canceled> {
+    let (rings, shapes) = (mesh.rings.clone(), Shapes::new(mesh, sampling));
+    let mut map = Inserter { directions, rings, shapes, objective, star: Star::default() };
+    let mut active: Vec<u32> = (0..mesh.positions.len() as u32).collect();
+    let (level, mut places) = map.level(&mut active, settings);
+    sweep(&level, &mut places, LAST_SWEEPS, &objective, settings)?;
+    let descent = descend(&level, &mut places, &objective, FINE, settings)?;
+    map.take(&level, &places);
+    Ok((map.directions, descent))
+}
+
+/// The map once every vertex is inserted.
+fn inserted(
     mesh: &Mesh,
     sampling: &Sampling,
     objective: Objective,
     settings: &Settings<'_>,
-) -> Result<Option<(SphereMap, Descent)>, Canceled> {
+) -> Result<Option<Vec<DVec3>>, Canceled> {
     let mut rings = mesh.rings.clone();
     let Some(log) = decimate(mesh, &mut rings, settings.cancel)? else {
         return Ok(None);
@@ -141,7 +150,7 @@ fn map_and_descent(
             map.take(&level, &places);
         }
     }
-    map.finish(&mut active, settings).map(Some)
+    Ok(Some(map.directions))
 }
 
 /// Sweeps until the energy falls slowly, at most six times as often as asked.
@@ -214,16 +223,6 @@ impl Inserter<'_> {
         let places = active.iter().map(|&v| self.directions[v as usize]).collect();
         let ring = |v| self.rings.ring(v);
         (Level::new(active.to_vec(), self.directions.len(), ring, |t| self.shapes.reference(t), settings), places)
-    }
-
-    /// The map with all vertices in place brought to its minimum, and how that went.
-    fn finish(&mut self, active: &mut [u32], settings: &Settings<'_>) -> Result<(SphereMap, Descent), Canceled> {
-        let (level, mut places) = self.level(active, settings);
-        sweep(&level, &mut places, LAST_SWEEPS, &self.objective, settings)?;
-        let descent = descend(&level, &mut places, &self.objective, FINE, settings)?;
-        self.take(&level, &places);
-        let directions = std::mem::take(&mut self.directions);
-        Ok((SphereMap { directions, energy: descent.energy / (4.0 * PI) }, descent))
     }
 
     /// Takes places back from a level.
@@ -403,17 +402,19 @@ mod tests {
 
     const ISOMETRIC: Objective = Objective { isometry: 1.0, area: 1.0, angle: 0.0 };
 
-    fn map(mesh: &Mesh, objective: Objective, threads: usize) -> (SphereMap, Descent) {
+    fn map(mesh: &Mesh, objective: Objective, threads: usize) -> (Vec<DVec3>, Descent) {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let cancel = CancelToken::new();
         let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_: Progress| {} };
-        map_and_descent(mesh, &Sampling::even(mesh.positions.len()), objective, &settings).unwrap().expect("a map")
+        let sampling = Sampling::even(mesh.positions.len());
+        let rough = sphere_map(mesh, &sampling, objective, &settings).unwrap().expect("a map");
+        descended(mesh, rough, &sampling, objective, &settings).unwrap()
     }
 
-    fn bijective(mesh: &Mesh, map: &SphereMap) {
+    fn bijective(mesh: &Mesh, map: &[DVec3]) {
         let mut whole = 0.0;
         for t in mesh.rings.triangles() {
-            let [a, b, c] = t.map(|v| map.directions[v as usize]);
+            let [a, b, c] = t.map(|v| map[v as usize]);
             let volume = a.dot(b.cross(c));
             assert!(volume > 0.0, "{t:?} is turned over");
             // solid angle (Van Oosterom and Strackee 1983)
@@ -425,10 +426,11 @@ mod tests {
     #[test]
     fn a_sphere_goes_to_itself_without_distortion() {
         let mesh = limb(24, 36, 0.0);
-        let (map, _) = map(&mesh, ISOMETRIC, 1);
+        let (map, descent) = map(&mesh, ISOMETRIC, 1);
         bijective(&mesh, &map);
         // the slivers at the poles are softened, which makes their references a little wrong
-        assert!(map.energy < 1.05 * ISOMETRIC.ideal(), "{}", map.energy);
+        let energy = descent.energy / (4.0 * PI);
+        assert!(energy < 1.05 * ISOMETRIC.ideal(), "{energy}");
     }
 
     #[test]
@@ -449,7 +451,7 @@ mod tests {
     fn the_map_has_the_same_bits_for_any_number_of_threads() {
         let mesh = limb(80, 64, 2.0);
         assert!(mesh.positions.len() > level::PARALLEL, "large enough to run in parallel");
-        assert_eq!(map(&mesh, ISOMETRIC, 1).0.directions, map(&mesh, ISOMETRIC, 7).0.directions);
+        assert_eq!(map(&mesh, ISOMETRIC, 1).0, map(&mesh, ISOMETRIC, 7).0);
     }
 
     #[test]
