@@ -192,6 +192,8 @@ pub fn choose_diagonals(
 ) -> Result<(), Canceled> {
     /// Of quads whose normals agree at least this well the field is not asked.
     const EVEN: f64 = 0.97;
+    /// A diagonal that leaves a triangle of less than this share of the other one's smaller triangle is not taken.
+    const SLIVER: f64 = 0.1;
     let normals: Vec<DVec3> = at.gradients.iter().map(|g| g.normalize_or_zero()).collect();
     let (mut asked, mut middles) = (Vec::new(), Vec::new());
     for (i, quad) in lattice.quads.iter().enumerate() {
@@ -205,6 +207,15 @@ pub fn choose_diagonals(
         }
         let mean = k.iter().map(|&v| normals[v]).sum::<DVec3>().normalize_or_zero();
         let p = k.map(|v| at.positions[v]);
+        // a triangle without area has no normal that could be wrong
+        let least = |t: [[usize; 3]; 2]| -> f64 {
+            t.iter().map(|c| twice_area(c.map(|j| p[j])).length()).fold(f64::INFINITY, f64::min)
+        };
+        let (first, other) = (least(FIRST), least(OTHER));
+        if first < SLIVER * other || other < SLIVER * first {
+            choice[i] = first < other;
+            continue;
+        }
         let flat = k.iter().all(|&v| normals[v].dot(mean) > EVEN);
         let first = unit_normal([p[0], p[1], p[2]]).dot(mean).min(unit_normal([p[0], p[2], p[3]]).dot(mean));
         if flat && first > 0.9 {
@@ -240,7 +251,44 @@ pub fn choose_diagonals(
 }
 
 /// How far a triangle's normal is from those of its corners: twice its area times one less their product.
-fn deviation([a, b, c]: [DVec3; 3], normals: [DVec3; 3]) -> f64 {
-    let normal = (b - a).cross(c - a);
+fn deviation(corners: [DVec3; 3], normals: [DVec3; 3]) -> f64 {
+    let normal = twice_area(corners);
     normal.length() - normal.dot(normals.iter().sum::<DVec3>().normalize_or_zero())
+}
+
+/// Along the normal, twice the area of a triangle.
+fn twice_area([a, b, c]: [DVec3; 3]) -> DVec3 {
+    (b - a).cross(c - a)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::lattice::LatticeSpec;
+    use super::*;
+    use crate::field::sampler::Tally;
+    use crate::field::scene::Scene;
+    use crate::measure::fixtures::with_settings;
+    use serde_json::json;
+
+    #[test]
+    fn no_diagonal_is_turned_so_that_a_triangle_loses_its_area() {
+        let lattice = SphereLattice::new(LatticeSpec::Latlong { n_theta: 48, n_phi: 24 });
+        let quad = 48 * 11 + 7;
+        let corners = lattice.quads[quad].map(|c| lattice.chart[c as usize] as usize);
+        let field = Scene::from_value(&json!({"sphere": {"radius": 1}})).expect("a scene");
+        // a corner put onto the diagonal between two others, almost
+        for (moved, [u, v], other) in [(3, [0, 2], true), (1, [0, 2], true), (0, [1, 3], false), (2, [1, 3], false)] {
+            let mut positions = lattice.directions.clone();
+            let middle = positions[corners[u]].midpoint(positions[corners[v]]);
+            positions[corners[moved]] = middle.lerp(positions[corners[moved]], 1e-3).normalize();
+            let at = OnZero { gradients: positions.clone(), values: vec![0.0; positions.len()], positions };
+            let mut choice = vec![false; lattice.quads.len()];
+            with_settings(1, |settings| {
+                let tally = Tally::new();
+                choose_diagonals(&Sampler::new(&field, *settings, &tally), &lattice, &at, &mut choice, |_| true)
+            })
+            .unwrap();
+            assert_eq!(choice[quad], other, "corner {moved}");
+        }
+    }
 }

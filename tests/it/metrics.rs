@@ -1,4 +1,5 @@
-//! Results against stored results: every example scene, and every network among the fixtures.
+//! Results against stored results: every example scene, every network among the fixtures, and some of the shared meshes where
+//! that folder is beside the repository.
 //!
 //! A file in `tests/metrics` holds what a field's result was when the file was written. A result may be better; it may be
 //! worse by no more than the tolerances below. After a change that is meant to move the figures:
@@ -96,6 +97,32 @@ fn fields() -> Vec<PathBuf> {
     fields
 }
 
+/// Meshes of every kind: organic and mechanical, with limbs, sharp edges and thin walls.
+const MESHES: [&str; 6] = [
+    "paper/spot.ply",
+    "paper/bunny.ply",
+    "paper/duck.ply",
+    "cad/fandisk.ply",
+    "cad/gen_spur_gear.ply",
+    "organic/koala.ply",
+];
+
+/// The [`MESHES`], where they are.
+fn meshes() -> Vec<PathBuf> {
+    let data = std::env::var_os("SHRINKD_DATA").map(PathBuf::from);
+    let data = data.unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"));
+    let folder = data.join("meshes");
+    if !folder.is_dir() {
+        println!("{} is not there: its meshes are not looked at", folder.display());
+        return Vec::new();
+    }
+    MESHES.iter().map(|name| folder.join(name)).collect()
+}
+
+fn is_mesh(field: &Path) -> bool {
+    field.extension().is_some_and(|e| e == "ply")
+}
+
 /// The result of a field, or what the program says about it.
 fn extract(field: &Path) -> Result<Metrics, String> {
     let folder = tempfile::tempdir().expect("folder");
@@ -105,6 +132,10 @@ fn extract(field: &Path) -> Result<Metrics, String> {
     // a network of many shapes needs one to be named
     if takes_a_latent_code(field) {
         command.args(["--latent-row", "0"]);
+    }
+    // the other lattice has its turn with the meshes
+    if is_mesh(field) {
+        command.args(["--lattice", "octahedral:72"]);
     }
     // the figures do not depend on it, and the fields are spread over the cores already
     let output = command.args(["--threads", "1"]).output().expect("runs");
@@ -125,7 +156,8 @@ fn takes_a_latent_code(field: &Path) -> bool {
 fn check(field: &Path, renew: bool) -> Vec<String> {
     // two formats may hold fields of one name
     let name = field.file_name().expect("a name").to_string_lossy().trim_end_matches(".json").to_owned();
-    let stored_in = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/metrics");
+    let folder = if is_mesh(field) { "tests/metrics/meshes" } else { "tests/metrics" };
+    let stored_in = Path::new(env!("CARGO_MANIFEST_DIR")).join(folder);
     let path = stored_in.join(format!("{name}.json"));
     let losses = match (extract(field), std::fs::read(&path)) {
         (Err(error), _) => vec![error],
@@ -143,7 +175,8 @@ fn check(field: &Path, renew: bool) -> Vec<String> {
 #[test]
 fn results_are_as_good_as_the_stored_metrics() {
     let renew = std::env::var_os("SHRINKD_RENEW_METRICS").is_some();
-    let fields = fields();
+    let mut fields = fields();
+    fields.extend(meshes());
     assert!(fields.len() >= 10, "the example scenes are there");
     let (next, losses) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
