@@ -319,6 +319,10 @@ mod tests {
         assert_eq!((made.report.attempts, parts), (1, vec![Part::Shrink, Part::Measure]));
         assert_eq!(made.report.evaluations.value + made.report.evaluations.gradient, spent);
         assert!(news.iter().all(|p| p.attempt == 1));
+        let energies = news.iter().filter(|p| p.stage == "resample").filter_map(|p| p.energy);
+        assert!(energies.clone().count() > 0 && energies.into_iter().all(f64::is_finite), "the map's energy is told");
+        let stages = &made.report.evaluations.by_stage;
+        assert!(stages["resample"].gradient > 0 && !stages.contains_key("map"), "{stages:?}");
     }
 
     #[test]

@@ -148,9 +148,12 @@ impl Opened {
     /// The same with a weight, opened like a field and pointed to below `at`.
     pub fn with_weight(mut self, spec: &FieldSpec, bytes: Option<&[u8]>, at: &str) -> Result<Self, Box<Failure>> {
         let opened = open(spec, bytes, at)?;
-        let found = opened.field.dimension();
-        if found != 3 || self.field.dimension() != 3 {
-            return Err(Box::new(Failure::from_shrink(&ShrinkError::Dimension { found, wanted: 3 })));
+        for found in [opened.field.dimension(), self.field.dimension()] {
+            if found != 3 {
+                let detail =
+                    format!("a weight is a field of dimension 3, for one of dimension 3, and one here has {found}");
+                return Err(Box::new(Failure::new("dimension", "the field has the wrong dimension for this", detail)));
+            }
         }
         self.weight = Some(opened.field);
         self.provenance["weight"] = opened.provenance;

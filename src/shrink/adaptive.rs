@@ -16,7 +16,7 @@ use super::unfold::Corners;
 use super::untangle::Tangle;
 use super::zero::{OnZero, project};
 use super::{Density, Distortion, Effort, ShrinkError, ShrinkSpec, Wrap};
-use crate::field::{Field, Sampler};
+use crate::field::{Field, Frame, Sampler};
 use crate::settings::{Canceled, Front, Progress, Settings};
 use glam::DVec3;
 
@@ -136,39 +136,28 @@ fn one(
     let sampler = scene.framed(frame);
     let mesh = base(front, (attempt.fineness * base_vertices(lattice)) as usize, &sampler)?;
     stage("map", 0.45, Some(show(&mesh.positions, mesh.rings.triangles())), None, None);
-    let mut sampling = match spec.density {
-        Density::Weight => {
-            let weight = weight.ok_or(ShrinkError::NoWeight)?;
-            let places = mesh.positions.iter().map(|&p| frame.to_scene(p));
-            Sampling::weighted(&mesh, places, &Sampler::new(weight, settings, scene.tally()))?
-                .ok_or(ShrinkError::NoWeight)?
-        }
-        kind => Sampling::new(&mesh, kind, &settings),
-    };
-    if spec.distortion == Distortion::Angle {
-        // a stretched surface has other angles
-        sampling.stretch = Sampling::even(mesh.positions.len()).stretch;
-    }
+    let mut sampling = sampling(&mesh, scene, frame, spec, weight)?;
     let wanting: Vec<DVec3> = places.iter().map(|&p| frame.from_scene(p)).collect();
     denser_at(&mesh, &wanting, attempt.insist, &mut sampling.density);
     let mut objective = spec.distortion.objective();
     objective.area *= attempt.area;
     let directions = sphere_map(&mesh, &sampling, objective, &settings)?.ok_or(ShrinkError::Unmapped)?;
-    let mut map = match (spec.lattice, spec.density) {
-        (LatticeSpec::Octahedral { .. }, Density::Curvature) if spec.distortion != Distortion::Angle => {
+    let mut map = match suits_cells(spec) {
+        false => settled(&mesh, directions, &sampling, objective, &settings)?,
+        true => {
             objective.area *= cells::AREA;
-            let across = sampling.stretch.clone();
+            let plain = sampling.stretch.clone();
             let mut fitted = |directions: Vec<DVec3>| {
                 let fit = cells::fit(&mesh, &directions);
-                sampling.stretch = across.iter().zip(fit).map(|(across, fit)| fit * *across).collect();
+                sampling.stretch = plain.iter().zip(fit).map(|(plain, fit)| fit * *plain).collect();
                 settled(&mesh, directions, &sampling, objective, &settings)
             };
             // a map that has moved has other cells
             let first = fitted(directions)?;
             fitted(first.directions)?
         }
-        _ => settled(&mesh, directions, &sampling, objective, &settings)?,
     };
+    stage("resample", 0.75, None, Some(map.energy), None);
     let mut landing = Landing::new(&mesh, &map, lattice, &settings)?;
     for round in 1..=attempt.denser {
         let base = Base { mesh: &mesh, directions: &landing.directions };
@@ -206,6 +195,39 @@ fn one(
     let left = separate(scene, &mut wrap, &[&to_scene(&blunt), &to_scene(&landed)], places)?;
     stage("separate", 1.0, None, None, Some(left.folds as u64));
     Ok(wrap)
+}
+
+/// How the base `mesh`, which is in `frame`, is to be sampled.
+fn sampling(
+    mesh: &Mesh,
+    scene: &Sampler<'_>,
+    frame: Frame,
+    spec: &ShrinkSpec,
+    weight: Option<&dyn Field>,
+) -> Result<Sampling, ShrinkError> {
+    let even = Sampling::even(mesh.positions.len());
+    let sampling = match spec.density {
+        Density::Area => even,
+        Density::Curvature if spec.distortion == Distortion::Angle => {
+            // a stretched surface has other angles
+            Sampling { stretch: even.stretch, ..Sampling::by_curvature(mesh) }
+        }
+        Density::Curvature => Sampling::by_curvature(mesh),
+        Density::Reach => Sampling::by_reach(mesh, scene.settings()),
+        Density::Weight => {
+            let weight = Sampler::new(weight.ok_or(ShrinkError::NoWeight)?, *scene.settings(), scene.tally());
+            let places = mesh.positions.iter().map(|&p| frame.to_scene(p));
+            Sampling::by_weight(mesh, places, &weight)?.ok_or(ShrinkError::NoWeight)?
+        }
+    };
+    Ok(sampling)
+}
+
+/// Whether the map is to suit the cells of the lattice: where facets are what counts, and the cells are uneven.
+fn suits_cells(spec: &ShrinkSpec) -> bool {
+    matches!(spec.lattice, LatticeSpec::Octahedral { .. })
+        && spec.density == Density::Curvature
+        && spec.distortion != Distortion::Angle
 }
 
 /// A lattice on the base surface.

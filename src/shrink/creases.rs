@@ -211,9 +211,9 @@ pub fn choose_diagonals(
         let least = |t: [[usize; 3]; 2]| -> f64 {
             t.iter().map(|c| twice_area(c.map(|j| p[j])).length()).fold(f64::INFINITY, f64::min)
         };
-        let (first, other) = (least(FIRST), least(OTHER));
-        if first < SLIVER * other || other < SLIVER * first {
-            choice[i] = first < other;
+        let (kept, turned) = (least(FIRST), least(OTHER));
+        if kept < SLIVER * turned || turned < SLIVER * kept {
+            choice[i] = kept < turned;
             continue;
         }
         let flat = k.iter().all(|&v| normals[v].dot(mean) > EVEN);

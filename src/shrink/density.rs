@@ -1,7 +1,6 @@
 //! How the surface is to be sampled: evenly by area, more where it is curved and there more across the curvature than along
 //! it, or more where the solid or the space beside it is thin, so that tips and limbs keep their shape.
 
-use super::Density;
 use super::energy::{add_outer, larger_axis, tangents};
 use super::points::Points;
 use super::rings::Mesh;
@@ -39,35 +38,28 @@ impl Sampling {
         Self { density: vec![1.0; vertices], stretch: vec![DMat3::IDENTITY; vertices] }
     }
 
-    /// With a density from 1 to [`RANGE`].
-    pub fn new(mesh: &Mesh, kind: Density, settings: &Settings<'_>) -> Self {
-        let n = mesh.positions.len();
-        let normals: Vec<DVec3> = (0..n as u32).map(|v| mesh.vertex_normal(v)).collect();
-        let unit = (mesh.area() / (4.0 * std::f64::consts::PI)).sqrt();
-        let rise = |narrowness: f64| (narrowness * unit / CALM).clamp(1.0, RANGE);
-        match kind {
-            Density::Area | Density::Weight => Self::even(n),
-            Density::Curvature => {
-                let turns = turns(mesh, &normals);
-                let density = turns.iter().map(|turn| rise((0.5 * trace(turn)).sqrt())).collect();
-                let turns = averaged(mesh, turns).into_iter().map(|turn| turn * (unit * unit));
-                let stretch = normals.iter().zip(turns).map(|(&normal, turn)| stretch(normal, &turn)).collect();
-                Self { density: averaged(mesh, density), stretch }
-            }
-            Density::Reach => {
-                let reach = reach(mesh, &normals, unit / CALM, settings);
-                let density = reach.into_iter().map(|radius| rise(1.0 / radius)).collect();
-                Self { density: averaged(mesh, density), ..Self::even(n) }
-            }
-        }
+    /// More where the surface is curved, and closer together across the curvature than along it; density from 1 to [`RANGE`].
+    pub fn by_curvature(mesh: &Mesh) -> Self {
+        let (normals, unit) = (normals(mesh), unit(mesh));
+        let turns = turns(mesh, &normals);
+        let density = turns.iter().map(|turn| rise((0.5 * trace(turn)).sqrt(), unit)).collect();
+        let turns = averaged(mesh, turns).into_iter().map(|turn| turn * (unit * unit));
+        let stretch = normals.iter().zip(turns).map(|(&normal, turn)| stretch(normal, &turn)).collect();
+        Self { density: averaged(mesh, density), stretch }
     }
-}
 
-impl Sampling {
+    /// More where the solid or the space beside it is thin; density from 1 to [`RANGE`].
+    pub fn by_reach(mesh: &Mesh, settings: &Settings<'_>) -> Self {
+        let unit = unit(mesh);
+        let reach = reach(mesh, &normals(mesh), unit / CALM, settings);
+        let density = reach.into_iter().map(|radius| rise(1.0 / radius, unit)).collect();
+        Self { density: averaged(mesh, density), ..Self::even(mesh.positions.len()) }
+    }
+
     /// In proportion to a weight, whose values are taken at the vertices' `places` in its scene or, outside its domain, at the
     /// nearest place of that. What is below a 16th of the largest value counts as that. `None` when no value is
     /// positive.
-    pub fn weighted(
+    pub fn by_weight(
         mesh: &Mesh,
         places: impl Iterator<Item = DVec3>,
         weight: &Sampler<'_>,
@@ -82,6 +74,20 @@ impl Sampling {
         let density = values.into_iter().map(|value| value.max(largest / WEIGHTS)).collect();
         Ok(Some(Self { density: averaged(mesh, density), ..Self::even(mesh.positions.len()) }))
     }
+}
+
+fn normals(mesh: &Mesh) -> Vec<DVec3> {
+    (0..mesh.positions.len() as u32).map(|v| mesh.vertex_normal(v)).collect()
+}
+
+/// Radius of the sphere of equal area.
+fn unit(mesh: &Mesh) -> f64 {
+    (mesh.area() / (4.0 * std::f64::consts::PI)).sqrt()
+}
+
+/// The density for a curvature.
+fn rise(curvature: f64, unit: f64) -> f64 {
+    (curvature * unit / CALM).clamp(1.0, RANGE)
 }
 
 /// Every vertex's mean with its ring, again and again.
@@ -199,10 +205,6 @@ mod tests {
         Mesh { positions, rings }
     }
 
-    fn made(mesh: &Mesh, kind: Density) -> Vec<f64> {
-        with_settings(2, |settings| Sampling::new(mesh, kind, settings).density)
-    }
-
     fn nearest(mesh: &Mesh, q: DVec3) -> usize {
         let distance = |v: &usize| mesh.positions[*v].distance_squared(q);
         (0..mesh.positions.len()).min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap()
@@ -213,11 +215,10 @@ mod tests {
         let plate = block(DVec3::new(1.0, 1.0, 0.05), 16);
         let middle = nearest(&plate, DVec3::new(0.0, 0.0, 0.05));
         let rim = nearest(&plate, DVec3::new(1.0, 0.0, 0.05));
-        assert!(made(&plate, Density::Area).iter().all(|&d| d == 1.0));
-        let by_curvature = made(&plate, Density::Curvature);
+        let by_curvature = Sampling::by_curvature(&plate).density;
         assert_eq!(by_curvature[middle], 1.0);
         assert!(by_curvature[rim] > 1.5, "{}", by_curvature[rim]);
-        let by_reach = made(&plate, Density::Reach);
+        let by_reach = with_settings(2, |settings| Sampling::by_reach(&plate, settings).density);
         assert!(by_reach[middle] > 0.95 * RANGE, "{}", by_reach[middle]);
     }
 
@@ -230,19 +231,18 @@ mod tests {
         let rings = Rings::new(positions.len(), &triangles).expect("a closed mesh");
         let needle = Mesh { positions, rings };
         let middle = nearest(&needle, 0.1 * DVec3::X);
-        let stretch = |kind| with_settings(1, |settings| Sampling::new(&needle, kind, settings).stretch[middle]);
+        let stretch = Sampling::by_curvature(&needle).stretch[middle];
         let side = ELONGATION.sqrt();
         for (edge, expected) in [(DVec3::Y, side), (DVec3::Z, 1.0 / side), (DVec3::X, 1.0)] {
-            let found = stretch(Density::Curvature) * edge;
+            let found = stretch * edge;
             assert!(found.distance(expected * edge) < 0.01, "{edge} became {found}");
         }
-        assert_eq!(stretch(Density::Area), DMat3::IDENTITY);
     }
 
     #[test]
     fn a_cube_is_thin_nowhere_and_its_reach_is_half_its_width_or_more() {
         let cube = block(DVec3::ONE, 16);
-        let normals: Vec<DVec3> = (0..cube.positions.len() as u32).map(|v| cube.vertex_normal(v)).collect();
+        let normals = normals(&cube);
         let middle = nearest(&cube, DVec3::Z);
         let reach = with_settings(1, |settings| reach(&cube, &normals, 10.0, settings)[middle]);
         assert!((reach - 1.0).abs() < 0.02, "the ball that fills the cube has radius 1, not {reach}");

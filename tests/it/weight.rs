@@ -66,11 +66,13 @@ fn the_command_line_takes_a_weight() {
     std::fs::write(path("ball.json"), r#"{"sphere": {"radius": 0.6}}"#).expect("writes");
     std::fs::write(path("weight.npy"), grid(3.0, 1.0)).expect("writes");
     std::fs::write(path("none.npy"), grid(0.0, 0.0)).expect("writes");
-    let run = |further: &[&str]| {
-        let (field, out) = (path("ball.json"), path("out.glb"));
+    std::fs::write(path("disc.json"), r#"{"circle": {"radius": 0.6}}"#).expect("writes");
+    let wrap = |field: &str, further: &[&str]| {
+        let (field, out) = (path(field), path("out.glb"));
         let arguments = ["extract", &field, "-o", &out, "--lattice", "octahedral:24"];
         Command::new(BINARY).args(arguments).args(further).output().expect("runs")
     };
+    let run = |further: &[&str]| wrap("ball.json", further);
     let output = run(&["--weight", &path("weight.npy")]);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let share = share_above(&std::fs::read(path("out.glb")).expect("reads"));
@@ -84,5 +86,10 @@ fn the_command_line_takes_a_weight() {
         let output = run(&further);
         let told = String::from_utf8_lossy(&output.stderr).into_owned();
         assert!(output.status.code() == Some(code) && told.contains(said), "{further:?}: {told}");
+    }
+    for (field, weight) in [("disc.json", "weight.npy"), ("ball.json", "disc.json")] {
+        let output = wrap(field, &["--weight", &path(weight)]);
+        let told = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.code() == Some(3) && told.contains("one here has 2"), "{field} {weight}: {told}");
     }
 }

@@ -1,0 +1,394 @@
+//! Reads a request, member by member, and collects its faults.
+
+use super::{
+    FieldSpec, JobSpec, MAX_LABEL_NAME, MAX_LABEL_VALUE, MAX_LABELS, MAX_LATENT, OutputName, SAMPLES, check_lattice,
+};
+use crate::extract::Budget;
+use crate::field::input::FieldOptions;
+use crate::field::{Fault, FieldError};
+use crate::job::JobKind;
+use crate::shrink::lattice::LatticeSpec;
+use crate::shrink::{Component, Density, Distortion, Effort, Method, OnTopology, ShrinkSpec};
+use serde_json::{Map, Value};
+use std::collections::BTreeMap;
+
+/// Faults reported in one answer.
+const MAX_FAULTS: usize = 32;
+
+/// What is wrong with a request.
+#[derive(Default)]
+pub struct Faults(pub Vec<Fault>);
+
+impl Faults {
+    pub fn add(&mut self, pointer: impl Into<String>, code: &'static str, detail: impl Into<String>) {
+        if self.0.len() < MAX_FAULTS {
+            self.0.push(Fault { pointer: pointer.into(), code, detail: detail.into() });
+        }
+    }
+
+    /// The members of an object; each one that is not `known` is a fault.
+    fn object<'v>(&mut self, value: &'v Value, pointer: &str, known: &[&str]) -> Option<&'v Map<String, Value>> {
+        let Some(object) = value.as_object() else {
+            self.add(pointer, "wrong_type", format!("expected an object, found {}", type_name(value)));
+            return None;
+        };
+        for name in object.keys().filter(|name| !known.contains(&name.as_str())) {
+            let detail = format!("unknown member {name:?}; known here: {}", known.join(", "));
+            self.add(format!("{pointer}/{}", escape(name)), "unknown_member", detail);
+        }
+        Some(object)
+    }
+
+    fn string<'v>(&mut self, value: &'v Value, pointer: &str) -> Option<&'v str> {
+        let found = value.as_str();
+        if found.is_none() {
+            self.add(pointer, "wrong_type", format!("expected a string, found {}", type_name(value)));
+        }
+        found
+    }
+
+    fn boolean(&mut self, value: &Value, pointer: &str) -> Option<bool> {
+        let found = value.as_bool();
+        if found.is_none() {
+            self.add(pointer, "wrong_type", format!("expected true or false, found {}", type_name(value)));
+        }
+        found
+    }
+
+    fn number(&mut self, value: &Value, pointer: &str) -> Option<f32> {
+        let Some(number) = value.as_f64() else {
+            self.add(pointer, "wrong_type", format!("expected a number, found {}", type_name(value)));
+            return None;
+        };
+        let single = number as f32;
+        if !single.is_finite() {
+            self.add(pointer, "not_finite", format!("{number} is not finite in single precision"));
+            return None;
+        }
+        Some(single)
+    }
+
+    fn count(&mut self, value: &Value, pointer: &str) -> Option<u32> {
+        let count = value.as_u64().and_then(|n| u32::try_from(n).ok());
+        if count.is_none() {
+            let detail = match value {
+                Value::Number(n) => format!("expected a whole number from 0 to {}, found {n}", u32::MAX),
+                other => format!("expected a whole number, found {}", type_name(other)),
+            };
+            self.add(pointer, "wrong_type", detail);
+        }
+        count
+    }
+}
+
+/// Reads a whole request; it means nothing when faults were found.
+pub fn read_spec(value: &Value, faults: &mut Faults) -> JobSpec {
+    let mut spec = JobSpec {
+        kind: JobKind::Shrink,
+        field: FieldSpec::default(),
+        weight: None,
+        shrink: ShrinkSpec::default(),
+        budget: Budget::default(),
+        outputs: vec![OutputName::Glb, OutputName::Preview, OutputName::Report],
+        labels: BTreeMap::new(),
+    };
+    let known = ["kind", "field", "weight", "shrink", "budget", "outputs", "labels"];
+    let Some(object) = faults.object(value, "", &known) else { return spec };
+    if let Some(kind) = object.get("kind").and_then(|kind| faults.string(kind, "/kind"))
+        && kind != "shrink"
+    {
+        faults.add("/kind", "unknown_value", format!("unknown kind {kind:?}; known: shrink"));
+    }
+    match object.get("field") {
+        Some(field) => spec.field = read_field(field, "/field", faults),
+        None => faults.add("/field", "missing_member", "a job needs a field"),
+    }
+    if let Some(shrink) = object.get("shrink") {
+        spec.shrink = read_shrink(shrink, faults);
+    }
+    if let Some(weight) = object.get("weight") {
+        spec.weight = Some(read_field(weight, "/weight", faults));
+        if object.get("shrink").and_then(|shrink| shrink.get("density")).is_none() {
+            spec.shrink.density = Density::Weight;
+        }
+    }
+    match (&spec.weight, spec.shrink.density) {
+        (None, Density::Weight) => faults.add("/weight", "missing_member", "density weight needs a weight, a field"),
+        (Some(_), density) if density != Density::Weight => {
+            faults.add("/shrink/density", "ambiguous", "a weight is given, so the density is weight");
+        }
+        _ => {}
+    }
+    if let Some(budget) = object.get("budget") {
+        spec.budget = read_budget(budget, faults);
+    }
+    if let Some(outputs) = object.get("outputs") {
+        spec.outputs = read_outputs(outputs, faults);
+    }
+    if let Some(labels) = object.get("labels") {
+        spec.labels = read_labels(labels, faults);
+    }
+    spec
+}
+
+/// Reads a field, or a weight, at `pointer`.
+fn read_field(value: &Value, pointer: &str, faults: &mut Faults) -> FieldSpec {
+    let mut field = FieldSpec::default();
+    let known = ["scene", "input", "latent", "latent_row", "transform", "domain", "level", "activation"];
+    let Some(object) = faults.object(value, pointer, &known) else { return field };
+    match (object.get("scene"), object.get("input")) {
+        (Some(scene), None) => field.scene = Some(scene.clone()),
+        (None, Some(input)) => {
+            if let Some(name) = faults.string(input, &format!("{pointer}/input")) {
+                field.input = name.parse().ok();
+                if field.input.is_none() {
+                    let detail = "expected sha256: and 64 lower-case hexadecimal digits";
+                    faults.add(format!("{pointer}/input"), "invalid_id", detail);
+                }
+            }
+        }
+        (Some(_), Some(_)) => faults.add(pointer, "ambiguous", "give scene or input, not both"),
+        (None, None) => faults.add(pointer, "missing_member", "give scene or input"),
+    }
+    field.options = FieldOptions {
+        latent: object.get("latent").and_then(|latent| read_latent(latent, &format!("{pointer}/latent"), faults)),
+        latent_row: object.get("latent_row").and_then(|row| faults.count(row, &format!("{pointer}/latent_row"))),
+        transform: option(object, pointer, "transform", "scale, rotate {axis [3], angle}, translate [3]", faults),
+        domain: option(object, pointer, "domain", "\"fit\" or {\"min\": [x, y, z], \"max\": [x, y, z]}", faults),
+        level: object.get("level").and_then(|level| faults.number(level, &format!("{pointer}/level"))),
+        activation: option(object, pointer, "activation", "the name of an activation", faults),
+    };
+    // what an option may be is known in the field's room
+    if let Err(FieldError::Invalid { faults: wrong }) = field.options.check() {
+        faults.0.extend(wrong.into_iter().map(|f| Fault { pointer: format!("{pointer}{}", f.pointer), ..f }));
+    }
+    field
+}
+
+/// A member that its own type reads.
+fn option<T: serde::de::DeserializeOwned>(
+    object: &Map<String, Value>,
+    pointer: &str,
+    name: &str,
+    expected: &str,
+    faults: &mut Faults,
+) -> Option<T> {
+    let value = object.get(name)?;
+    match T::deserialize(value) {
+        Ok(read) => Some(read),
+        Err(error) => {
+            faults.add(format!("{pointer}/{name}"), "invalid_value", format!("expected {expected}: {error}"));
+            None
+        }
+    }
+}
+
+fn read_latent(value: &Value, pointer: &str, faults: &mut Faults) -> Option<Vec<f32>> {
+    let Some(list) = value.as_array() else {
+        faults.add(pointer, "wrong_type", format!("expected a list of numbers, found {}", type_name(value)));
+        return None;
+    };
+    if list.len() > MAX_LATENT {
+        faults.add(pointer, "too_many", format!("{} numbers, and at most {MAX_LATENT} are read", list.len()));
+        return None;
+    }
+    let numbers = list.iter().enumerate().map(|(i, n)| faults.number(n, &format!("{pointer}/{i}")));
+    // a plain collect would stop at the first fault
+    let numbers: Vec<Option<f32>> = numbers.collect();
+    numbers.into_iter().collect()
+}
+
+fn read_shrink(value: &Value, faults: &mut Faults) -> ShrinkSpec {
+    let mut shrink = ShrinkSpec::default();
+    let known = ["method", "lattice", "density", "distortion", "relax_uv", "on_topology", "component", "samples"];
+    let Some(object) = faults.object(value, "/shrink", &known) else { return shrink };
+    use {Density as D, Distortion as K, Method as M, OnTopology as T};
+    let methods = [("adaptive", M::Adaptive), ("paper", M::Paper)];
+    let densities = [("area", D::Area), ("curvature", D::Curvature), ("reach", D::Reach), ("weight", D::Weight)];
+    let distortions = [("area", K::Area), ("angle", K::Angle), ("isometric", K::Isometric)];
+    let topologies = [("refuse", T::Refuse), ("wrap", T::Wrap)];
+    choose(object, "method", &methods, &mut shrink.method, faults);
+    choose(object, "density", &densities, &mut shrink.density, faults);
+    choose(object, "distortion", &distortions, &mut shrink.distortion, faults);
+    choose(object, "on_topology", &topologies, &mut shrink.on_topology, faults);
+    if let Some(relax) = object.get("relax_uv") {
+        shrink.relax_uv = faults.boolean(relax, "/shrink/relax_uv").unwrap_or_default();
+    }
+    shrink.component = object.get("component").and_then(|component| read_component(component, faults));
+    if let Some(lattice) = object.get("lattice").and_then(|lattice| read_lattice(lattice, faults)) {
+        faults.0.extend(check_lattice(lattice, "/shrink/lattice"));
+        shrink.lattice = lattice;
+    }
+    if let Some(samples) = object.get("samples") {
+        shrink.samples = faults.count(samples, "/shrink/samples");
+        if let Some(n) = shrink.samples.filter(|n| !SAMPLES.contains(n)) {
+            let detail = format!("{n} is not in {} to {}", SAMPLES.start(), SAMPLES.end());
+            faults.add("/shrink/samples", "out_of_range", detail);
+        }
+    }
+    shrink
+}
+
+/// A member of `shrink` that is one of a few names.
+fn choose<T: Copy>(
+    object: &Map<String, Value>,
+    member: &str,
+    known: &[(&str, T)],
+    chosen: &mut T,
+    faults: &mut Faults,
+) {
+    let pointer = format!("/shrink/{member}");
+    let Some(name) = object.get(member).and_then(|value| faults.string(value, &pointer)) else { return };
+    match known.iter().find(|(known, _)| *known == name) {
+        Some((_, value)) => *chosen = *value,
+        None => {
+            let names: Vec<&str> = known.iter().map(|(name, _)| *name).collect();
+            let detail = format!("unknown {member} {name:?}; known: {}", names.join(", "));
+            faults.add(pointer, "unknown_value", detail);
+        }
+    }
+}
+
+fn read_component(value: &Value, faults: &mut Faults) -> Option<Component> {
+    const POINTER: &str = "/shrink/component";
+    match value {
+        Value::String(name) if name == "largest" => Some(Component::Largest),
+        Value::String(name) => {
+            let detail = format!("unknown component {name:?}; give \"largest\" or an index from 0");
+            faults.add(POINTER, "unknown_value", detail);
+            None
+        }
+        Value::Number(_) => faults.count(value, POINTER).map(Component::Index),
+        other => {
+            let detail = format!("expected \"largest\" or an index, found {}", type_name(other));
+            faults.add(POINTER, "wrong_type", detail);
+            None
+        }
+    }
+}
+
+fn read_budget(value: &Value, faults: &mut Faults) -> Budget {
+    let mut budget = Budget::default();
+    let Some(object) = faults.object(value, "/budget", &["attempts", "evaluations"]) else { return budget };
+    if let Some(attempts) = object.get("attempts").and_then(|n| faults.count(n, "/budget/attempts")) {
+        if (1..=Effort::ATTEMPTS).contains(&attempts) {
+            budget.attempts = Some(attempts);
+        } else {
+            let detail = format!("{attempts} is not in 1 to {}", Effort::ATTEMPTS);
+            faults.add("/budget/attempts", "out_of_range", detail);
+        }
+    }
+    match object.get("evaluations").map(|n| (n, n.as_u64())) {
+        None => {}
+        Some((_, Some(0))) => faults.add("/budget/evaluations", "out_of_range", "0 evaluations make no surface"),
+        Some((_, Some(evaluations))) => budget.evaluations = Some(evaluations),
+        Some((n, None)) => {
+            let found = if n.is_number() { n.to_string() } else { type_name(n).to_owned() };
+            faults.add("/budget/evaluations", "wrong_type", format!("expected a whole number, found {found}"));
+        }
+    }
+    budget
+}
+
+fn read_lattice(value: &Value, faults: &mut Faults) -> Option<LatticeSpec> {
+    let object = faults.object(value, "/shrink/lattice", &["latlong", "octahedral"])?;
+    let mut sizes = |kind: &str, names: &[&str]| -> Option<Vec<u32>> {
+        let pointer = format!("/shrink/lattice/{kind}");
+        let members = faults.object(&object[kind], &pointer, names)?;
+        let read = names.iter().map(|name| {
+            let pointer = format!("{pointer}/{name}");
+            match members.get(*name) {
+                Some(size) => faults.count(size, &pointer),
+                None => {
+                    faults.add(pointer, "missing_member", format!("a lattice {kind} needs {name}"));
+                    None
+                }
+            }
+        });
+        let read: Vec<Option<u32>> = read.collect();
+        read.into_iter().collect()
+    };
+    match (object.contains_key("latlong"), object.contains_key("octahedral")) {
+        (true, false) => {
+            let sizes = sizes("latlong", &["n_theta", "n_phi"])?;
+            Some(LatticeSpec::Latlong { n_theta: sizes[0], n_phi: sizes[1] })
+        }
+        (false, true) => Some(LatticeSpec::Octahedral { n: sizes("octahedral", &["n"])?[0] }),
+        _ => {
+            faults.add("/shrink/lattice", "ambiguous", "give exactly one of latlong and octahedral");
+            None
+        }
+    }
+}
+
+fn read_outputs(value: &Value, faults: &mut Faults) -> Vec<OutputName> {
+    let Some(list) = value.as_array() else {
+        faults.add("/outputs", "wrong_type", format!("expected a list of names, found {}", type_name(value)));
+        return Vec::new();
+    };
+    if list.is_empty() {
+        faults.add("/outputs", "too_few", "a job makes at least one output");
+    }
+    let mut outputs = Vec::new();
+    for (i, item) in list.iter().enumerate() {
+        let pointer = format!("/outputs/{i}");
+        let Some(name) = faults.string(item, &pointer) else { continue };
+        match OutputName::from_name(name) {
+            Some(output) if outputs.contains(&output) => {
+                faults.add(pointer, "duplicate", format!("{name:?} is named twice"));
+            }
+            Some(output) => outputs.push(output),
+            None => {
+                let known = OutputName::ALL.map(OutputName::name).join(", ");
+                faults.add(pointer, "unknown_value", format!("unknown output {name:?}; known: {known}"));
+            }
+        }
+    }
+    outputs.sort_unstable();
+    outputs
+}
+
+fn read_labels(value: &Value, faults: &mut Faults) -> BTreeMap<String, String> {
+    let mut labels = BTreeMap::new();
+    let Some(object) = value.as_object() else {
+        faults.add("/labels", "wrong_type", format!("expected an object, found {}", type_name(value)));
+        return labels;
+    };
+    if object.len() > MAX_LABELS {
+        faults.add("/labels", "too_many", format!("{} labels, and at most {MAX_LABELS} are kept", object.len()));
+        return labels;
+    }
+    for (name, value) in object {
+        let pointer = format!("/labels/{}", escape(name));
+        let letters = |c: char| c.is_ascii_alphanumeric() || "._-/".contains(c);
+        if name.is_empty() || name.chars().count() > MAX_LABEL_NAME || !name.chars().all(letters) {
+            let detail = format!("a label's name is 1 to {MAX_LABEL_NAME} of the characters a-z A-Z 0-9 . _ - /");
+            faults.add(pointer, "invalid_label", detail);
+            continue;
+        }
+        let Some(text) = faults.string(value, &pointer) else { continue };
+        if text.chars().count() > MAX_LABEL_VALUE || text.chars().any(char::is_control) {
+            let detail = format!("a label's value is at most {MAX_LABEL_VALUE} characters, none of them control");
+            faults.add(pointer, "invalid_label", detail);
+            continue;
+        }
+        labels.insert(name.clone(), text.to_owned());
+    }
+    labels
+}
+
+/// A member's name as a token of a JSON Pointer (RFC 6901).
+fn escape(name: &str) -> String {
+    name.replace('~', "~0").replace('/', "~1")
+}
+
+fn type_name(value: &Value) -> &'static str {
+    match value {
+        Value::Null => "null",
+        Value::Bool(_) => "a boolean",
+        Value::Number(_) => "a number",
+        Value::String(_) => "a string",
+        Value::Array(_) => "a list",
+        Value::Object(_) => "an object",
+    }
+}
