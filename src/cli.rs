@@ -9,14 +9,15 @@ pub mod extract;
 pub mod first_job;
 pub mod healthcheck;
 mod interrupt;
+mod options;
 pub mod serve;
 
 use crate::field::Domain;
 use crate::field::input::{DomainName, DomainOption, FieldOptions};
 use crate::measure::chart::SphereChart;
 use crate::shrink::lattice::LatticeSpec;
-use crate::shrink::{Component, Density, Distortion, Method, OnTopology};
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use options::{ShrinkArgs, parse_lattice};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -85,39 +86,18 @@ pub struct ExtractArgs {
     /// Where the GLB goes
     #[arg(short, long, value_name = "OUT.glb")]
     pub output: PathBuf,
-    /// How the sphere is contracted
-    #[arg(long, value_enum, default_value_t = MethodArg::Adaptive)]
-    pub method: MethodArg,
     /// Where the sphere is sampled: latlong:N_THETAxN_PHI or octahedral:N
     #[arg(long, value_parser = parse_lattice, default_value = "latlong:200x100")]
     pub lattice: LatticeSpec,
     /// Samples of the curve that a 2-D scene gives [default: N_THETA of the lattice]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(8..=100_000))]
     pub samples: Option<u32>,
-    /// How the samples are spread over the surface
-    #[arg(long, value_enum, default_value_t = DensityArg::Curvature)]
-    pub density: DensityArg,
     /// A field whose values say how closely samples are spaced where: in proportion, instead of --density
     #[arg(long, value_name = "FIELD", conflicts_with = "density")]
     pub weight: Option<PathBuf>,
-    /// What the sphere map keeps best
-    #[arg(long, value_enum, default_value_t = DistortionArg::Isometric)]
-    pub distortion: DistortionArg,
-    /// Relax the UVs further inside the chart, by what --distortion keeps; the sphere's coordinates become TEXCOORD_1
-    #[arg(long)]
-    pub relax_uv: bool,
-    /// What to do with a shape that has handles or several components
-    #[arg(long, value_enum, default_value_t = OnTopologyArg::Refuse)]
-    pub on_topology: OnTopologyArg,
-    /// Component to wrap where there are several: largest, or an index from 0, largest first
-    #[arg(long, value_name = "WHICH", value_parser = parse_component)]
-    pub component: Option<Component>,
-    /// Attempts at most, each with more effort, until one passes [default: 3]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=3))]
-    pub attempts: Option<u32>,
-    /// Field evaluations that a further attempt may not go beyond
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
-    pub max_evaluations: Option<u64>,
+    /// How it is wrapped.
+    #[command(flatten)]
+    pub shrink: ShrinkArgs,
     /// What the field leaves open.
     #[command(flatten)]
     pub field_options: FieldArgs,
@@ -238,6 +218,7 @@ Examples:
   shrinkd compare examples/scenes
   shrinkd compare meshes --out results --expect-refusal 'genus/*'
   shrinkd compare meshes --only spot --only bunny --lattice octahedral:144 --no-baseline
+  shrinkd compare meshes --only 'genus/*' --on-topology wrap --density reach
 
 Exits 0 when every shape succeeded or was refused as expected, 1 when one did not or the run was interrupted, 2 on bad
 usage, 3 when the folder cannot be read or holds no field.";
@@ -251,9 +232,9 @@ pub struct CompareArgs {
     /// [default: latlong:200x100 and octahedral:72]
     #[arg(long, value_parser = parse_lattice)]
     pub lattice: Vec<LatticeSpec>,
-    /// How the sphere is contracted
-    #[arg(long, value_enum, default_value_t = MethodArg::Adaptive)]
-    pub method: MethodArg,
+    /// How it is wrapped.
+    #[command(flatten)]
+    pub shrink: ShrinkArgs,
     /// Folder for compare.md and compare.json, written as results come, and a contact sheet of pictures for every lattice
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
@@ -278,110 +259,6 @@ pub struct CompareArgs {
     /// Threads; 0 is one per core. The results do not depend on it
     #[arg(long, default_value_t = 0)]
     pub threads: usize,
-}
-
-/// How the sphere is contracted.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum MethodArg {
-    /// Topology-keeping contraction and a bijective sphere map
-    Adaptive,
-    /// The paper's loop as printed
-    Paper,
-}
-
-impl From<MethodArg> for Method {
-    fn from(method: MethodArg) -> Self {
-        match method {
-            MethodArg::Adaptive => Method::Adaptive,
-            MethodArg::Paper => Method::Paper,
-        }
-    }
-}
-
-/// How the samples are spread over the surface.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum DensityArg {
-    /// Evenly by area
-    Area,
-    /// More where the surface is curved
-    Curvature,
-    /// More where the solid or the space beside it is thin
-    Reach,
-}
-
-impl From<DensityArg> for Density {
-    fn from(density: DensityArg) -> Self {
-        match density {
-            DensityArg::Area => Density::Area,
-            DensityArg::Curvature => Density::Curvature,
-            DensityArg::Reach => Density::Reach,
-        }
-    }
-}
-
-/// What the sphere map keeps best.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum DistortionArg {
-    /// Areas, as far as the density allows
-    Area,
-    /// Angles
-    Angle,
-    /// Both: lengths
-    Isometric,
-}
-
-impl From<DistortionArg> for Distortion {
-    fn from(distortion: DistortionArg) -> Self {
-        match distortion {
-            DistortionArg::Area => Distortion::Area,
-            DistortionArg::Angle => Distortion::Angle,
-            DistortionArg::Isometric => Distortion::Isometric,
-        }
-    }
-}
-
-/// What to do with a shape that is no sphere.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum OnTopologyArg {
-    /// Say how many components or handles there are and where
-    Refuse,
-    /// Wrap it all the same and say how much area had to be invented
-    Wrap,
-}
-
-impl From<OnTopologyArg> for OnTopology {
-    fn from(on_topology: OnTopologyArg) -> Self {
-        match on_topology {
-            OnTopologyArg::Refuse => OnTopology::Refuse,
-            OnTopologyArg::Wrap => OnTopology::Wrap,
-        }
-    }
-}
-
-/// `largest` or an index.
-fn parse_component(text: &str) -> Result<Component, String> {
-    match text {
-        "largest" => Ok(Component::Largest),
-        index => index.parse().map(Component::Index).map_err(|_| "expected largest or an index from 0".to_owned()),
-    }
-}
-
-/// `latlong:200x100` or `octahedral:72`.
-fn parse_lattice(text: &str) -> Result<LatticeSpec, String> {
-    let number = |n: &str| n.parse::<u32>().map_err(|_| format!("{n:?} is not a whole number"));
-    let lattice = match text.split_once(':') {
-        Some(("latlong", sizes)) => {
-            let (n_theta, n_phi) = sizes.split_once('x').ok_or("expected latlong:N_THETAxN_PHI")?;
-            LatticeSpec::Latlong { n_theta: number(n_theta)?, n_phi: number(n_phi)? }
-        }
-        Some(("octahedral", n)) => LatticeSpec::Octahedral { n: number(n)? },
-        _ => return Err("expected latlong:N_THETAxN_PHI or octahedral:N".to_owned()),
-    };
-    let faults = crate::job::spec::check_lattice(lattice, "");
-    match faults.first() {
-        Some(fault) => Err(format!("{}: {}", fault.pointer.trim_start_matches('/'), fault.detail)),
-        None => Ok(lattice),
-    }
 }
 
 /// `fit`, or six numbers.
@@ -426,15 +303,6 @@ fn fail(code: u8, error: &dyn std::fmt::Display) -> ExitCode {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_lattice_is_read_as_it_is_written_and_kept_within_limits() {
-        assert_eq!(parse_lattice("latlong:200x100"), Ok(LatticeSpec::Latlong { n_theta: 200, n_phi: 100 }));
-        assert_eq!(parse_lattice("octahedral:72"), Ok(LatticeSpec::Octahedral { n: 72 }));
-        for wrong in ["latlong:200", "octahedral:x", "cube:3", "octahedral:501", "latlong:7x100", "octahedral:-1"] {
-            assert!(parse_lattice(wrong).is_err(), "{wrong}");
-        }
-    }
 
     #[test]
     fn the_arguments_are_consistent() {

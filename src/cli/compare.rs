@@ -16,7 +16,7 @@ use crate::settings::CancelToken;
 use crate::shrink::lattice::LatticeSpec;
 use crate::surface::sheet::{Tile, to_png};
 use row::Row;
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 use shapes::{Shape, find};
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
@@ -56,7 +56,8 @@ fn compare(args: &CompareArgs) -> Result<bool, (u8, String)> {
     let mut log = Log::new(args, &lattices)?;
     let mut unread = Vec::new();
     let task = one::Task {
-        method: args.method.into(),
+        asked: args.shrink.spec(LATTICES[0]),
+        budget: args.shrink.budget(),
         lattices: &lattices,
         baseline: !args.no_baseline,
         limit: args.limit.map(Duration::from_secs),
@@ -93,6 +94,8 @@ struct Log<'a> {
     json: Option<PathBuf>,
     lattices: &'a [LatticeSpec],
     dir: &'a Path,
+    /// The options of wrapping, by their names in a request.
+    options: Map<String, Value>,
 }
 
 impl<'a> Log<'a> {
@@ -114,8 +117,9 @@ impl<'a> Log<'a> {
             json,
             lattices,
             dir: &args.dir,
+            options: options(args),
         };
-        log.say(&row::head())?;
+        log.say(&row::head(&log.options))?;
         Ok(log)
     }
 
@@ -175,6 +179,7 @@ impl<'a> Log<'a> {
         let document = json!({
             "folder": self.dir.to_string_lossy(),
             "version": env!("CARGO_PKG_VERSION"),
+            "options": self.options,
             "partial": partial,
             "rows": self.rows,
             "summary": summary::of(&self.rows, self.lattices),
@@ -185,6 +190,16 @@ impl<'a> Log<'a> {
         let written = std::fs::write(&beside, format!("{document:#}\n"));
         written.and_then(|()| std::fs::rename(&beside, path)).map_err(|e| told(path, &e))
     }
+}
+
+/// What was asked of every shape, but for the lattices.
+fn options(args: &CompareArgs) -> Map<String, Value> {
+    let mut options = Map::new();
+    for part in [json!(args.shrink.spec(LATTICES[0])), json!(args.shrink.budget())] {
+        options.extend(part.as_object().cloned().unwrap_or_default());
+    }
+    options.retain(|name, value| name != "lattice" && !value.is_null());
+    options
 }
 
 fn told(path: &Path, error: &std::io::Error) -> (u8, String) {

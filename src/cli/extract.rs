@@ -1,7 +1,6 @@
 //! `shrinkd extract`: one field in, files out, and one line that says how good they are.
 
 use super::{BAD_INPUT, BAD_USAGE, ExtractArgs, FAILED, NOT_WRAPPED, fail};
-use crate::extract::Budget;
 use crate::job::failure::{Ended, Failure};
 use crate::job::pipeline::{self, Asked, CurveMade, Made, Opened};
 use crate::job::spec::{FieldSpec, OutputName};
@@ -47,17 +46,11 @@ fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
         });
     };
     let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress };
-    let shrink = ShrinkSpec {
-        method: args.method.into(),
-        lattice: args.lattice,
-        density: if args.weight.is_some() { Density::Weight } else { args.density.into() },
-        distortion: args.distortion.into(),
-        relax_uv: args.relax_uv,
-        on_topology: args.on_topology.into(),
-        component: args.component,
-        samples: args.samples,
-    };
-    let budget = Budget { attempts: args.attempts, evaluations: args.max_evaluations };
+    let mut shrink = ShrinkSpec { samples: args.samples, ..args.shrink.spec(args.lattice) };
+    if args.weight.is_some() {
+        shrink.density = Density::Weight;
+    }
+    let budget = args.shrink.budget();
     let load_seconds = clock.elapsed().as_secs_f64();
     let asked = |outputs| Asked { shrink: &shrink, budget, outputs, load_seconds };
     let ended = |ended: Ended| match ended {

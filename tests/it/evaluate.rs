@@ -182,6 +182,36 @@ fn a_folder_is_compared_with_a_row_per_shape_and_lattice() {
 }
 
 #[test]
+fn a_folder_is_compared_as_the_options_say() {
+    let folder = tempfile::tempdir().expect("folder");
+    put(folder.path(), "ring.json", RING);
+    put(folder.path(), "egg.json", EGG);
+    let (dir, file) = (folder.path().to_string_lossy(), folder.path().join("found"));
+    let file_name = file.to_string_lossy();
+    let compare = |further: &[&str]| {
+        let mut arguments = vec!["compare", &*dir, "--json", &*file_name, "--no-baseline", "--lattice", SMALL];
+        arguments.extend(further);
+        let output = shrinkd(&arguments);
+        assert_eq!(output.status.code(), Some(0), "{}{}", stdout(&output), stderr(&output));
+        (json(&file), stdout(&output))
+    };
+    let (found, table) = compare(&["--on-topology", "wrap", "--attempts", "2"]);
+    let ring = found["rows"].as_array().and_then(|rows| rows.iter().find(|r| r["shape"] == "ring.json"));
+    let ring = ring.expect("a row");
+    assert_eq!(ring["result"], "passed");
+    assert!(ring["report"]["topology"]["invented_area"].as_f64() > Some(0.0), "{:#}", ring["report"]);
+    assert_eq!((&found["options"]["on_topology"], &found["options"]["attempts"]), (&"wrap".into(), &2.into()));
+    assert!(table.starts_with("Options: ") && table.contains("on_topology wrap"), "{table}");
+
+    let angles = |distortion: &str| {
+        let (found, _) = compare(&["--only", "egg", "--distortion", distortion, "--density", "area"]);
+        found["rows"][0]["report"]["distortion"]["sphere"].clone()
+    };
+    let (angle, area) = (angles("angle"), angles("area"));
+    assert!(angle["log_area_rms"].as_f64() > area["log_area_rms"].as_f64(), "{angle} {area}");
+}
+
+#[test]
 fn a_folder_without_fields_and_bad_arguments_are_told_apart() {
     let folder = tempfile::tempdir().expect("folder");
     put(folder.path(), "notes.md", "no field");

@@ -16,8 +16,8 @@ use crate::measure::baseline::{Baseline, baseline, side_for};
 use crate::measure::report::passes;
 use crate::measure::truth::Truth;
 use crate::settings::{CancelToken, Canceled, Progress, Settings};
+use crate::shrink::ShrinkSpec;
 use crate::shrink::lattice::LatticeSpec;
-use crate::shrink::{Method, ShrinkSpec};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::sync::Arc;
@@ -31,8 +31,10 @@ const TICK: Duration = Duration::from_millis(20);
 
 /// What is done with every shape.
 pub struct Task<'a> {
-    /// How the sphere is contracted.
-    pub method: Method,
+    /// How it is wrapped, on whatever lattice.
+    pub asked: ShrinkSpec,
+    /// What may be spent on one lattice.
+    pub budget: Budget,
     /// On which lattices.
     pub lattices: &'a [LatticeSpec],
     /// Whether marching cubes is run beside.
@@ -135,13 +137,13 @@ fn wrapped(
     beside: &mut Beside<'_, '_>,
 ) -> Result<(Row, Vec<u8>), Ended> {
     let clock = Instant::now();
-    let spec = ShrinkSpec { method: task.method, lattice, ..ShrinkSpec::default() };
+    let spec = ShrinkSpec { lattice, ..task.asked.clone() };
     let outputs: &[OutputName] = if task.draw || task.keep.is_some() { &[OutputName::Glb] } else { &[] };
     // what is measured after shrinking is not part of its time in the field
     let progress = |progress: Progress| watch.pause(matches!(progress.stage, "measure" | "write"));
     watch.reset();
     watch.pause(false);
-    let asked = Asked { shrink: &spec, budget: Budget::default(), outputs, load_seconds: load };
+    let asked = Asked { shrink: &spec, budget: task.budget, outputs, load_seconds: load };
     let made = guarded(task, &|cancel| {
         let settings = Settings { pool: task.pool, cancel, progress: &progress };
         pipeline::make(opened, &asked, settings)
@@ -260,7 +262,8 @@ mod tests {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
         let stop = CancelToken::new();
         let task = Task {
-            method: Method::Adaptive,
+            asked: ShrinkSpec::default(),
+            budget: Budget::default(),
             lattices: &[],
             baseline: false,
             limit,

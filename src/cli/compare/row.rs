@@ -4,6 +4,7 @@ use crate::measure::Report;
 use crate::measure::baseline::Baseline;
 use crate::shrink::lattice::LatticeSpec;
 use serde::Serialize;
+use serde_json::{Map, Value};
 use std::fmt::Write as _;
 
 /// What became of a shape on a lattice.
@@ -151,9 +152,11 @@ const HEAD: [&str; 21] = [
     "why",
 ];
 
-/// What stands before the rows.
-pub fn head() -> String {
-    let mut text = String::from(
+/// What stands before the rows; `options` are those of wrapping.
+pub fn head(options: &Map<String, Value>) -> String {
+    let options: Vec<String> = options.iter().map(|(name, value)| format!("{name} {value}").replace('"', "")).collect();
+    let mut text = format!("Options: {}.\n\n", options.join(", "));
+    text.push_str(
         "Distances in parts of the diagonal of the truth's bounding box. MC: marching cubes of as many vertices on the same \
          field. Area ratio (percentiles over triangles), log-area and symmetric Dirichlet: sphere to surface, areas matched \
          globally. Field: seconds of shrinking in which the field was being evaluated.\n\n|",
@@ -198,7 +201,7 @@ mod tests {
             baseline: None,
         };
         let cells = |line: &str| line.replace("\\|", "").matches('|').count() - 1;
-        for line in head().lines().filter(|l| l.starts_with('|')) {
+        for line in head(&Map::new()).lines().filter(|l| l.starts_with('|')) {
             assert_eq!(cells(line), COLUMNS, "{line}");
         }
         let failed = Outcome::Failed { code: "crashed".to_owned(), faults: vec!["two\nlines".to_owned()] };
