@@ -11,6 +11,7 @@ use super::reclaim::{Base, missed, reclaim};
 use super::resample::{land, orient};
 use super::rings::Mesh;
 use super::separate::separate;
+use super::slide::slide;
 use super::sphere_map::{SphereMap, settled, sphere_map};
 use super::unfold::Corners;
 use super::untangle::Tangle;
@@ -178,6 +179,10 @@ fn one(
     let triangles = lattice.triangles(&diagonals);
     let tangle = Tangle::new(&sampler, &triangles, &at.positions);
     let folds = tangle.relax_patches(&mut at, &landed, 2)?;
+    stage("slide", 0.92, Some(show(&at.positions, triangles.clone())), None, Some(folds as u64));
+    let moved = slide(&sampler, &triangles, &Corners::new(at.positions.len(), &triangles), &mut at, edge)?;
+    turn_diagonals(&sampler, lattice, &at, &mut diagonals, &moved)?;
+    let triangles = lattice.triangles(&diagonals);
     stage("sharpen", 0.95, Some(show(&at.positions, triangles)), None, Some(folds as u64));
     let blunt = at.positions.clone();
     let base = Base { mesh: &mesh, directions: &directions };
@@ -262,10 +267,19 @@ fn sharpen(
     let mut moved = snap(sampler, &triangles, &corners, at)?;
     let edge = (base.mesh.area() / lattice.directions.len() as f64).sqrt();
     moved.extend(reclaim(sampler, base, lattice, &triangles, &corners, at, edge)?);
-    let mut mask = vec![false; at.positions.len()];
-    for v in moved {
-        mask[v as usize] = true;
-    }
-    choose_diagonals(sampler, lattice, at, &mut diagonals, |v| mask[v])?;
+    turn_diagonals(sampler, lattice, at, &mut diagonals, &moved)?;
     Ok(diagonals)
+}
+
+/// Chooses the diagonals around vertices that have moved.
+fn turn_diagonals(
+    sampler: &Sampler<'_>,
+    lattice: &SphereLattice,
+    at: &OnZero,
+    diagonals: &mut [bool],
+    moved: &[u32],
+) -> Result<(), Canceled> {
+    let mut mask = vec![false; at.positions.len()];
+    moved.iter().for_each(|&v| mask[v as usize] = true);
+    choose_diagonals(sampler, lattice, at, diagonals, |v| mask[v])
 }

@@ -17,12 +17,12 @@ mod sweep;
 mod system;
 
 use super::Distortion;
+use super::colours::colours;
 use super::energy::{Objective, Reference};
 use super::lattice::{LatticeSpec, SphereLattice};
 use crate::settings::{Canceled, Progress, Settings};
 use glam::{DMat2, DVec2, DVec3};
 use rayon::prelude::*;
-use sweep::colours;
 use system::{Rows, System};
 
 /// Softening of slivers in the reference triangles, as in the sphere map.
@@ -176,7 +176,7 @@ impl Chart {
         let freedom: Vec<DVec2> = places.iter().map(|p| DVec2::new(side(p.x, aspect), side(p.y, -1.0))).collect();
         let rows = Rows::new(places.len(), &pieces);
         let border = border(&pieces).into_iter().map(|e| (e, places[e[1] as usize] - places[e[0] as usize])).collect();
-        let colours = colours(&rows, places.len());
+        let colours = colours(places.len(), |v| rows.neighbours(v));
         Some((Self { pieces, freedom, border, rows, colours, objective }, places))
     }
 

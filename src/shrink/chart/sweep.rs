@@ -2,34 +2,11 @@
 //! nearly flattened above all, only they see.
 
 use super::super::energy::inverse_positive;
-use super::system::{Corner, Rows, derivatives, held};
+use super::system::{Corner, derivatives, held};
 use super::{CHUNK, Chart, outer, single};
 use crate::settings::{Canceled, Settings};
 use glam::{DMat2, DVec2};
 use rayon::prelude::*;
-
-/// Vertices by colour: those of one colour share no triangle, so that each can take its step without knowing the others'.
-pub fn colours(rows: &Rows, vertices: usize) -> Vec<Vec<u32>> {
-    let mut colours: Vec<Vec<u32>> = Vec::new();
-    let mut of = vec![usize::MAX; vertices];
-    // the last vertex that saw a colour beside it
-    let mut seen: Vec<usize> = Vec::new();
-    for v in 0..vertices {
-        for &u in rows.neighbours(v) {
-            if let Some(by) = seen.get_mut(of[u as usize]) {
-                *by = v;
-            }
-        }
-        let free = seen.iter().position(|&by| by != v).unwrap_or(seen.len());
-        if free == seen.len() {
-            seen.push(usize::MAX);
-            colours.push(Vec::new());
-        }
-        of[v] = free;
-        colours[free].push(v as u32);
-    }
-    colours
-}
 
 impl Chart {
     /// One step of every vertex. The energy never rises, and as no triangle around a vertex turns over, no two vertices of the

@@ -3,6 +3,7 @@
 //! Vertices of one colour share no triangle, so each of them can take its step without knowing the others': the result
 //! does not depend on who computes which, and no triangle turns over.
 
+use super::super::colours::colours;
 use super::super::energy::{Objective, Reference};
 use super::star::{POSITIVE, Relaxed, Star};
 use crate::settings::{Canceled, Settings};
@@ -82,7 +83,7 @@ impl Level {
         let shapes = &level.shapes;
         level.references =
             level.places.iter().map(|at| shapes[at.triangle as usize].turned(at.corner.into())).collect();
-        level.colour();
+        level.colours = colours(level.len(), |v| level.ring(v));
         level
     }
 
@@ -129,27 +130,6 @@ impl Level {
             }
         }
         (self.places, self.triangles) = (places, triangles);
-    }
-
-    /// The first colour that no neighbour has, vertex by vertex.
-    fn colour(&mut self) {
-        let mut colours = vec![u32::MAX; self.len()];
-        // the last vertex that saw a colour in its ring
-        let mut seen: Vec<u32> = Vec::new();
-        for v in 0..self.len() {
-            for &u in &self.ring[self.range(v)] {
-                if let Some(seen) = seen.get_mut(colours[u as usize] as usize) {
-                    *seen = v as u32;
-                }
-            }
-            let free = seen.iter().position(|&by| by != v as u32).unwrap_or(seen.len());
-            if free == seen.len() {
-                seen.push(u32::MAX);
-                self.colours.push(Vec::new());
-            }
-            colours[v] = free as u32;
-            self.colours[free].push(v as u32);
-        }
     }
 
     /// Lists made for every vertex, one after the other.
