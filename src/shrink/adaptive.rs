@@ -180,7 +180,7 @@ fn one(
     let tangle = Tangle::new(&sampler, &triangles, &at.positions);
     let folds = tangle.relax_patches(&mut at, &landed, 2)?;
     stage("slide", 0.92, Some(show(&at.positions, triangles.clone())), None, Some(folds as u64));
-    let moved = slide(&sampler, &triangles, &Corners::new(at.positions.len(), &triangles), &mut at, edge)?;
+    let moved = slide(&sampler, lattice, &triangles, &mut at, edge)?;
     turn_diagonals(&sampler, lattice, &at, &mut diagonals, &moved)?;
     let triangles = lattice.triangles(&diagonals);
     stage("sharpen", 0.95, Some(show(&at.positions, triangles)), None, Some(folds as u64));

@@ -10,7 +10,7 @@ use std::f64::consts::FRAC_PI_2;
 /// How much of the cells' shape is made up for, as a power of their ratio of sides: the sphere's own shapes count, too.
 const POWER: f64 = 0.7;
 /// Factor on the weight of areas in the map, which is what a change of shape costs.
-pub const AREA: f64 = 1.4;
+pub const AREA: f64 = 1.2;
 
 /// What edges of `mesh` are multiplied by before they are mapped, at every vertex: matrices that keep areas in the tangent
 /// plane and lengthen what lies along the longer sides of the lattice's triangles at the vertex's direction.

@@ -97,7 +97,7 @@ impl super::Distortion {
         match self {
             Self::Area => Objective { isometry: 0.5, area: 4.0, angle: 0.0 },
             Self::Angle => Objective { isometry: 0.1, area: 0.0, angle: 1.0 },
-            Self::Isometric => Objective { isometry: 1.0, area: 1.5, angle: 0.5 },
+            Self::Isometric => Objective { isometry: 1.0, area: 1.3, angle: 0.5 },
         }
     }
     /// The weights that a chart is relaxed by: there is no lattice to come whose facets are to be good, so what is asked for

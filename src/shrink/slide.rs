@@ -6,6 +6,7 @@
 
 use super::colours::colours;
 use super::energy::{inverse_positive, tangents};
+use super::lattice::SphereLattice;
 use super::unfold::Corners;
 use super::zero::{OnZero, project};
 use crate::field::Sampler;
@@ -17,10 +18,12 @@ use rayon::prelude::*;
 const SWEEPS: usize = 6;
 /// Weight of a facet's change of area against its normal's deviation.
 const KEEP: f64 = 0.15;
+/// What has less than this share of its due on the sphere is drawn up to it.
+const FLOOR: f64 = 0.7;
 /// Weight of how much the normals of a facet's corners differ: what is curved gets smaller facets.
 const SPREAD: f64 = 1.5;
 /// A vertex whose facets deviate less than this, on average, stays.
-const CALM: f64 = 0.008;
+const CALM: f64 = 0.012;
 /// A vertex goes at most this share of its mean edge.
 const REACH: f64 = 0.6;
 /// Vertices worth a piece of parallel work.
@@ -75,15 +78,18 @@ impl Patch {
     }
 }
 
-/// A facet of a vertex's star: its other two corners, the sum of their normals, and twice the area it began with.
+/// A facet of a vertex's star.
 struct Facet {
+    /// Its other two corners, ...
     others: [DVec3; 2],
+    /// ... and the sum of their normals.
     normals: DVec3,
+    /// Twice the area it is to have.
     area: f64,
 }
 
 impl Facet {
-    /// Twice the area times how far the facet is from the normals of its corners, and from the area it had.
+    /// Twice the area times how far the facet is from the normals of its corners, and from the area it is to have.
     fn energy(&self, place: DVec3, normal: DVec3) -> f64 {
         let across = (self.others[0] - place).cross(self.others[1] - place);
         let (area, sum) = (across.length(), self.normals + normal);
@@ -131,7 +137,7 @@ struct Slide<'a> {
     corners: &'a Corners,
     places: Vec<DVec3>,
     normals: Vec<DVec3>,
-    /// Twice the area that every triangle began with.
+    /// Twice the area that every triangle is to have: what it began with, and not much less than its due.
     areas: Vec<f64>,
 }
 
@@ -190,30 +196,30 @@ impl Slide<'_> {
     }
 }
 
-/// Slides the vertices whose facets deviate from the normals, and returns which moved.
+/// Slides the vertices whose facets deviate from the normals, and returns which moved. `triangles` are those of the lattice,
+/// `edge` its typical edge on the surface.
 pub fn slide(
     sampler: &Sampler<'_>,
+    lattice: &SphereLattice,
     triangles: &[[u32; 3]],
-    corners: &Corners,
     at: &mut OnZero,
     edge: f64,
 ) -> Result<Vec<u32>, Canceled> {
-    /// A triangle without area is measured against this share of the mean.
-    const SLIVER: f64 = 0.1;
     /// A move below this share of the reach is none.
     const MOVED: f64 = 0.02;
     let settings = sampler.settings();
+    let corners = Corners::new(at.positions.len(), triangles);
     let normals: Vec<DVec3> = at.gradients.iter().map(|g| g.normalize_or(DVec3::Z)).collect();
-    let across = |t: &[u32; 3]| {
-        let [a, b, c] = t.map(|v| at.positions[v as usize]);
-        (b - a).cross(c - a).length()
-    };
-    let mut areas: Vec<f64> = triangles.iter().map(across).collect();
-    let least = SLIVER * areas.iter().sum::<f64>() / areas.len() as f64;
-    areas.iter_mut().for_each(|area| *area = area.max(least));
+    let areas = |places: &[DVec3]| -> Vec<f64> { triangles.iter().map(|&t| twice_area(places, t)).collect() };
+    let (mut areas, dues) = (areas(&at.positions), areas(&lattice.directions));
+    let scale = FLOOR * areas.iter().sum::<f64>() / dues.iter().sum::<f64>();
+    for (area, due) in areas.iter_mut().zip(dues) {
+        *area = area.max(scale * due);
+    }
     let next = |&corner: &u32| triangles[corner as usize / 3][(corner as usize % 3 + 1) % 3];
     let rings: Vec<Vec<u32>> = (0..normals.len() as u32).map(|v| corners.at(v).iter().map(next).collect()).collect();
-    let mut surface = Slide { triangles, corners, places: at.positions.clone(), normals: normals.clone(), areas };
+    let mut surface =
+        Slide { triangles, corners: &corners, places: at.positions.clone(), normals: normals.clone(), areas };
     let patches = surface.patches(&rings, settings);
     let moves = surface.run(&rings, &patches, settings)?;
     let far = |v: usize| patches[v].as_ref().is_some_and(|p| moves[v].length() > MOVED * p.reach);
@@ -225,8 +231,13 @@ pub fn slide(
     for (k, &v) in moved.iter().enumerate() {
         (at.positions[v], at.values[v], at.gradients[v]) = (found.positions[k], found.values[k], found.gradients[k]);
     }
-    take_back(triangles, corners, &moved, &before, at);
+    take_back(triangles, &corners, &moved, &before, at);
     Ok(moved.into_iter().map(|v| v as u32).collect())
+}
+
+fn twice_area(places: &[DVec3], t: [u32; 3]) -> f64 {
+    let [a, b, c] = t.map(|v| places[v as usize]);
+    (b - a).cross(c - a).length()
 }
 
 /// Takes the corners of triangles back that the field turns over, where it is not what their neighbours' normals promised.
@@ -254,5 +265,118 @@ fn take_back(triangles: &[[u32; 3]], corners: &Corners, moved: &[usize], before:
                 (before.positions[v], before.values[v], before.gradients[v]);
         }
         stars = back.iter().flat_map(|&v| corners.at(v)).map(|&c| c / 3).collect();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::lattice::LatticeSpec;
+    use super::*;
+    use crate::field::sampler::Tally;
+    use crate::field::scene::Scene;
+    use crate::measure::fixtures::with_settings;
+    use serde_json::json;
+
+    const MAJOR: f64 = 0.6;
+    const MINOR: f64 = 0.1;
+
+    /// The middle of the tube at an angle around the z axis, and the tube's direction there.
+    fn bend(angle: f64) -> (DVec3, DVec3) {
+        (MAJOR * DVec3::new(angle.cos(), angle.sin(), 0.0), DVec3::new(-angle.sin(), angle.cos(), 0.0))
+    }
+
+    /// A lattice on a limb that is bent almost to a ring, a torus but for its ends: cells ten times as long as they are wide,
+    /// every other vertex `pushed` along the limb.
+    fn limb(pushed: f64) -> (SphereLattice, Vec<[u32; 3]>, Scene, OnZero) {
+        let lattice = SphereLattice::new(LatticeSpec::Octahedral { n: 12 });
+        let triangles = lattice.triangles(&vec![false; lattice.quads.len()]);
+        let field = Scene::from_value(&json!({"torus": {"major": MAJOR, "minor": MINOR}})).expect("a scene");
+        let place = |(v, d): (usize, &DVec3)| {
+            let push = if v % 2 == 0 { pushed * (1.0 - d.z.abs()) } else { 0.0 };
+            let (middle, along) = bend(2.8 * (d.z + push));
+            let flat = DVec3::new(d.x, d.y, 0.0).normalize_or_zero();
+            let normal = flat.x * middle.normalize() - flat.y * DVec3::Z;
+            if d.z.abs() > 0.98 { (middle, along * d.z.signum()) } else { (middle + MINOR * normal, normal) }
+        };
+        let (positions, gradients): (Vec<DVec3>, _) = lattice.directions.iter().enumerate().map(place).unzip();
+        (lattice, triangles, field, OnZero { values: vec![0.0; positions.len()], positions, gradients })
+    }
+
+    /// Mean deviation of facets from the torus's normals at their middles, away from the ends.
+    fn deviation(triangles: &[[u32; 3]], lattice: &SphereLattice, at: &OnZero) -> f64 {
+        let normal = |p: DVec3| (p - MAJOR * DVec3::new(p.x, p.y, 0.0).normalize()).normalize();
+        let (mut deviation, mut whole) = (0.0, 0.0);
+        for t in triangles.iter().filter(|t| t.iter().all(|&v| lattice.directions[v as usize].z.abs() < 0.9)) {
+            let [a, b, c] = t.map(|v| at.positions[v as usize]);
+            let across = (b - a).cross(c - a);
+            deviation += across.length() - across.dot(normal((a + b + c) / 3.0));
+            whole += across.length();
+        }
+        deviation / whole
+    }
+
+    fn slid(
+        threads: usize,
+        at: &OnZero,
+        field: &Scene,
+        triangles: &[[u32; 3]],
+        lattice: &SphereLattice,
+    ) -> (OnZero, usize, u64) {
+        with_settings(threads, |settings| {
+            let (tally, mut at) = (Tally::new(), at.clone());
+            let sampler = Sampler::new(field, *settings, &tally);
+            let moved = slide(&sampler, lattice, triangles, &mut at, 0.05).expect("slides");
+            (at, moved.len(), tally.total().gradient)
+        })
+    }
+
+    #[test]
+    fn facets_agree_better_and_vertices_stay_on_the_zero_level_set() {
+        let (lattice, triangles, field, at) = limb(0.06);
+        let (after, moved, evaluated) = slid(2, &at, &field, &triangles, &lattice);
+        let (first, last) = (deviation(&triangles, &lattice, &at), deviation(&triangles, &lattice, &after));
+        assert!(last < 0.7 * first, "{first} to {last}");
+        assert!(moved > 100 && evaluated <= 3 * moved as u64, "{moved} moved, {evaluated} evaluated");
+        let off = |p: &DVec3| (p.z.hypot(p.x.hypot(p.y) - MAJOR) - MINOR).abs();
+        let tube = (0..at.positions.len()).filter(|&v| lattice.directions[v].z.abs() < 0.9);
+        assert!(tube.into_iter().all(|v| off(&after.positions[v]) < 1e-3));
+        let (alone, ..) = slid(1, &at, &field, &triangles, &lattice);
+        assert_eq!(alone.positions, after.positions, "the same bits for any number of threads");
+    }
+
+    #[test]
+    fn what_agrees_already_stays_and_costs_nothing() {
+        let lattice = SphereLattice::new(LatticeSpec::Octahedral { n: 24 });
+        let triangles = lattice.triangles(&vec![false; lattice.quads.len()]);
+        let field = Scene::from_value(&json!({"sphere": {"radius": 1}})).expect("a scene");
+        let positions = lattice.directions.clone();
+        let at = OnZero { values: vec![0.0; positions.len()], gradients: positions.clone(), positions };
+        let (after, moved, evaluated) = slid(1, &at, &field, &triangles, &lattice);
+        assert_eq!((after.positions == at.positions, moved, evaluated), (true, 0, 0));
+    }
+
+    #[test]
+    fn edges_and_tips_are_not_left() {
+        let ring: Vec<u32> = (1..5).collect();
+        let places = [DVec3::ZERO, DVec3::X, DVec3::Y, -DVec3::X, -DVec3::Y];
+        let flat = [DVec3::Z; 5];
+        let patch = Patch::new(&places, &flat, 0, &ring).expect("a flat place");
+        assert_eq!(patch.at(DVec2::new(0.1, 0.0)).0.z, 0.0);
+        let mut edge = flat;
+        edge[1] = DVec3::X;
+        assert!(Patch::new(&places, &edge, 0, &ring).is_none());
+    }
+
+    #[test]
+    fn a_patch_follows_a_sphere_to_second_order() {
+        let (lattice, triangles, ..) = limb(0.0);
+        let sphere = &lattice.directions;
+        let corners = Corners::new(sphere.len(), &triangles);
+        let v = 100;
+        let ring: Vec<u32> =
+            corners.at(v).iter().map(|&c| triangles[c as usize / 3][(c as usize % 3 + 1) % 3]).collect();
+        let patch = Patch::new(sphere, sphere, v as usize, &ring).expect("a smooth place");
+        let (place, normal) = patch.at(DVec2::new(0.02, -0.01));
+        assert!((place.length() - 1.0).abs() < 1e-5 && normal.dot(place.normalize()) > 1.0 - 1e-5, "{place} {normal}");
     }
 }
