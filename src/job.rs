@@ -109,7 +109,8 @@ impl State {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(default)]
 pub struct ProgressView {
-    /// Name of the stage.
+    /// Name of the stage: `topology`, then in every attempt `contract`, `remesh`, `map`, `resample`, `untangle`, `slide`, `sharpen`,
+    /// `separate` and `measure`, then `relax` (with `relax_uv`) and `write`; the method `paper` has `shrink` before `measure`.
     pub stage: String,
     /// Number of the attempt at the surface, from 1 (not of the worker's, which the job counts); 0 before the first.
     pub attempt: u32,

@@ -2,12 +2,13 @@
 //!
 //! On a limb the map's cells are long and thin, and where the surface bends along them, a vertex halfway between two others
 //! lifts its facets off the tangent plane, like the folds of Schwarz's lantern. Sliding by a fraction of a cell takes that away. Vertices move
-//! on the surface to second order, as their neighbours' normals give it; the field is asked once, where they end.
+//! on the surface to second order, as their neighbours' normals give it; the field is asked only where they end.
 
 use super::colours::colours;
 use super::energy::{inverse_positive, tangents};
 use super::lattice::SphereLattice;
 use super::unfold::Corners;
+use super::untangle::normal;
 use super::zero::{OnZero, project};
 use crate::field::Sampler;
 use crate::settings::{Canceled, Settings};
@@ -210,7 +211,7 @@ pub fn slide(
     let settings = sampler.settings();
     let corners = Corners::new(at.positions.len(), triangles);
     let normals: Vec<DVec3> = at.gradients.iter().map(|g| g.normalize_or(DVec3::Z)).collect();
-    let areas = |places: &[DVec3]| -> Vec<f64> { triangles.iter().map(|&t| twice_area(places, t)).collect() };
+    let areas = |places: &[DVec3]| -> Vec<f64> { triangles.iter().map(|&t| normal(places, t).length()).collect() };
     let (mut areas, dues) = (areas(&at.positions), areas(&lattice.directions));
     let scale = FLOOR * areas.iter().sum::<f64>() / dues.iter().sum::<f64>();
     for (area, due) in areas.iter_mut().zip(dues) {
@@ -235,20 +236,14 @@ pub fn slide(
     Ok(moved.into_iter().map(|v| v as u32).collect())
 }
 
-fn twice_area(places: &[DVec3], t: [u32; 3]) -> f64 {
-    let [a, b, c] = t.map(|v| places[v as usize]);
-    (b - a).cross(c - a).length()
-}
-
 /// Takes the corners of triangles back that the field turns over, where it is not what their neighbours' normals promised.
 fn take_back(triangles: &[[u32; 3]], corners: &Corners, moved: &[usize], before: &OnZero, at: &mut OnZero) {
     /// How well a triangle agrees with the normals of its corners that none is taken back for.
     const AGREES: f64 = 0.3;
     let agreement = |at: &OnZero, t: u32| {
-        let t = triangles[t as usize].map(|v| v as usize);
-        let [a, b, c] = t.map(|v| at.positions[v]);
-        let normal = (b - a).cross(c - a).normalize_or_zero();
-        t.iter().map(|&v| normal.dot(at.gradients[v].normalize_or_zero())).fold(1.0, f64::min)
+        let t = triangles[t as usize];
+        let normal = normal(&at.positions, t).normalize_or_zero();
+        t.iter().map(|&v| normal.dot(at.gradients[v as usize].normalize_or_zero())).fold(1.0, f64::min)
     };
     let mut stars: Vec<u32> = moved.iter().flat_map(|&v| corners.at(v as u32)).map(|&c| c / 3).collect();
     while !stars.is_empty() {
@@ -307,9 +302,9 @@ mod tests {
         let normal = |p: DVec3| (p - MAJOR * DVec3::new(p.x, p.y, 0.0).normalize()).normalize();
         let (mut deviation, mut whole) = (0.0, 0.0);
         for t in triangles.iter().filter(|t| t.iter().all(|&v| lattice.directions[v as usize].z.abs() < 0.9)) {
-            let [a, b, c] = t.map(|v| at.positions[v as usize]);
-            let across = (b - a).cross(c - a);
-            deviation += across.length() - across.dot(normal((a + b + c) / 3.0));
+            let across = super::normal(&at.positions, *t);
+            let middle = t.iter().map(|&v| at.positions[v as usize]).sum::<DVec3>() / 3.0;
+            deviation += across.length() - across.dot(normal(middle));
             whole += across.length();
         }
         deviation / whole

@@ -141,7 +141,8 @@ pub fn masked(mask: &[bool]) -> Vec<u32> {
     (0..mask.len() as u32).filter(|&v| mask[v as usize]).collect()
 }
 
-fn normal(positions: &[DVec3], t: [u32; 3]) -> DVec3 {
+/// Normal of a triangle, as long as twice its area.
+pub(super) fn normal(positions: &[DVec3], t: [u32; 3]) -> DVec3 {
     let [a, b, c] = t.map(|v| positions[v as usize]);
     (b - a).cross(c - a)
 }

@@ -6,7 +6,7 @@ use super::kinds::{KINDS, Kind};
 use super::node::{Combine, Node, Shape, Similarity, place};
 use super::polygon::Polygon;
 use super::trust::neighbours;
-use crate::field::{Fault, FieldError};
+use crate::field::{Fault, FieldError, type_name};
 use serde_json::{Map, Value};
 
 /// Bytes of a scene's JSON.
@@ -134,7 +134,7 @@ impl Parser {
             return None;
         }
         let Some(object) = value.as_object() else {
-            self.fault("wrong_type", format!("a node is an object, and this is {}", describe(value)));
+            self.fault("wrong_type", format!("a node is an object, and this is {}", type_name(value)));
             return None;
         };
         let mut names = object.iter();
@@ -160,7 +160,7 @@ impl Parser {
         let Some(members) = body.as_object() else {
             self.fault(
                 "wrong_type",
-                format!("the members of {} are an object, and this is {}", kind.name, describe(body)),
+                format!("the members of {} are an object, and this is {}", kind.name, type_name(body)),
             );
             return None;
         };
@@ -331,7 +331,7 @@ impl Parser {
         let smooth = m.contains_key("k").then(|| self.length(m, "k"));
         let children = self.at("of", |p| {
             let Some(list) = m["of"].as_array() else {
-                p.fault("wrong_type", format!("this is a list of nodes, and here is {}", describe(&m["of"])));
+                p.fault("wrong_type", format!("this is a list of nodes, and here is {}", type_name(&m["of"])));
                 return None;
             };
             if list.is_empty() {
@@ -455,15 +455,4 @@ impl Parser {
 fn across(v: [f64; 3]) -> [f32; 3] {
     let flat = v[0].hypot(v[1]);
     if flat > 0.0 { [(-v[1] / flat) as f32, (v[0] / flat) as f32, 0.0] } else { [1.0, 0.0, 0.0] }
-}
-
-fn describe(value: &Value) -> &'static str {
-    match value {
-        Value::Null => "null",
-        Value::Bool(_) => "a boolean",
-        Value::Number(_) => "a number",
-        Value::String(_) => "a string",
-        Value::Array(_) => "a list",
-        Value::Object(_) => "an object",
-    }
 }

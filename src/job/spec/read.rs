@@ -5,7 +5,7 @@ use super::{
 };
 use crate::extract::Budget;
 use crate::field::input::FieldOptions;
-use crate::field::{Fault, FieldError};
+use crate::field::{Fault, FieldError, type_name};
 use crate::job::JobKind;
 use crate::shrink::lattice::LatticeSpec;
 use crate::shrink::{Component, Density, Distortion, Effort, Method, OnTopology, ShrinkSpec};
@@ -380,15 +380,4 @@ fn read_labels(value: &Value, faults: &mut Faults) -> BTreeMap<String, String> {
 /// A member's name as a token of a JSON Pointer (RFC 6901).
 fn escape(name: &str) -> String {
     name.replace('~', "~0").replace('/', "~1")
-}
-
-fn type_name(value: &Value) -> &'static str {
-    match value {
-        Value::Null => "null",
-        Value::Bool(_) => "a boolean",
-        Value::Number(_) => "a number",
-        Value::String(_) => "a string",
-        Value::Array(_) => "a list",
-        Value::Object(_) => "an object",
-    }
 }

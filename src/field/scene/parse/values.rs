@@ -1,7 +1,8 @@
 //! The values of members: numbers, lengths, vectors, polygons, each checked and each fault named at its place.
 
 use super::super::polygon::{Defect, defect};
-use super::{Dimension, LARGEST, MAX_POINTS, MAX_POLYGON, Members, Parser, SMALLEST, describe};
+use super::{Dimension, LARGEST, MAX_POINTS, MAX_POLYGON, Members, Parser, SMALLEST};
+use crate::field::type_name;
 use serde_json::Value;
 
 impl Parser {
@@ -36,7 +37,7 @@ impl Parser {
 
     pub(super) fn number(&mut self, value: &Value) -> Option<f64> {
         let Some(number) = value.as_f64() else {
-            self.fault("wrong_type", format!("this is a number, and here is {}", describe(value)));
+            self.fault("wrong_type", format!("this is a number, and here is {}", type_name(value)));
             return None;
         };
         if !number.is_finite() {
@@ -78,7 +79,7 @@ impl Parser {
     /// A list of as many values as the dimension has, or of two or three where it is not known.
     pub(super) fn list<'v>(&mut self, value: &'v Value, dimension: Option<Dimension>) -> Option<&'v [Value]> {
         let Some(list) = value.as_array() else {
-            self.fault("wrong_type", format!("this is a list of numbers, and here is {}", describe(value)));
+            self.fault("wrong_type", format!("this is a list of numbers, and here is {}", type_name(value)));
             return None;
         };
         let (fits, wanted) = match dimension {
@@ -117,7 +118,7 @@ impl Parser {
 
     pub(super) fn polygon(&mut self, value: &Value) -> Option<Vec<[f64; 2]>> {
         let Some(list) = value.as_array() else {
-            self.fault("wrong_type", format!("a polygon is a list of points, and this is {}", describe(value)));
+            self.fault("wrong_type", format!("a polygon is a list of points, and this is {}", type_name(value)));
             return None;
         };
         self.points += list.len();
