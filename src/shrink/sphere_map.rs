@@ -9,8 +9,9 @@
 
 mod decimate;
 mod level;
-pub(super) mod newton;
+mod newton;
 mod star;
+pub(super) mod system;
 
 use super::density::Sampling;
 use super::energy::{Objective, Reference};
@@ -27,7 +28,7 @@ use std::f64::consts::PI;
 /// Softening of slivers in the reference triangles.
 const SOFTENING: f64 = 0.02;
 /// The whole map is relaxed each time it has grown by this factor.
-const GROWTH: f64 = 1.4;
+const GROWTH: f64 = 1.6;
 /// Sweeps at every such growth: while the mesh is small, and later.
 const SWEEPS: (usize, usize) = (24, 2);
 /// A mesh of fewer vertices is small.
@@ -42,11 +43,11 @@ struct Steps {
     fewest: usize,
     most: usize,
 }
-const NEWTON: Steps = Steps { work: 10_000, fewest: 2, most: 40 };
+const NEWTON: Steps = Steps { work: 5_000, fewest: 2, most: 40 };
 /// A descent at a growth. Far from the minimum a step that is known better is not a longer one: the barriers stop it.
 const COARSE: Effort = Effort { steps: 0, products: 40, tolerance: 1e-3 };
 /// The last descent.
-const FINE: Effort = Effort { steps: 24, products: 40, tolerance: 1e-4 };
+const FINE: Effort = Effort { steps: 24, products: 40, tolerance: 2e-4 };
 /// A new vertex whose energy per area is above this is in trouble, and a growing patch around it is relaxed.
 const TROUBLE: f64 = 100.0;
 /// A new vertex whose energy per area is below this many times the ideal leaves its ring as it is.
@@ -162,7 +163,7 @@ fn sweep(
     settings: &Settings<'_>,
 ) -> Result<(), Canceled> {
     for round in 0..6 * sweeps {
-        let fallen = level.sweep(places, objective, settings)?;
+        let fallen = level.sweep(places, objective, f64::INFINITY, settings)?;
         // an energy that was infinite falls by infinity
         if fallen < 1e-7 || (round + 1 >= sweeps && fallen < 0.5) {
             break;
@@ -443,7 +444,7 @@ mod tests {
         ] {
             let (map, descent) = map(&mesh, objective, 2);
             bijective(&mesh, &map);
-            assert!(descent.decrement < 2e-3, "{objective:?} {descent:?}");
+            assert!(descent.decrement < 1e-3, "{objective:?} {descent:?}");
         }
     }
 
@@ -470,7 +471,7 @@ mod tests {
         let mut last = level.energy(&places, &ISOMETRIC, &settings);
         for round in 0..12 {
             if round % 2 == 0 {
-                level.sweep(&mut places, &ISOMETRIC, &settings).unwrap();
+                level.sweep(&mut places, &ISOMETRIC, f64::INFINITY, &settings).unwrap();
             } else {
                 descend(&level, &mut places, &ISOMETRIC, Effort { steps: 1, products: 30, tolerance: 0.0 }, &settings)
                     .unwrap();

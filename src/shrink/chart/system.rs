@@ -1,7 +1,7 @@
 //! The Newton system of a chart: gradient and Hessian by vertex, and conjugate gradients on the coordinates that may move.
 
 use super::super::energy::inverse_positive;
-use super::super::sphere_map::newton::positive_modes;
+use super::super::sphere_map::system::positive_modes;
 use super::{CHUNK, Chart, Piece, outer, squared};
 use crate::settings::{Canceled, Settings};
 use glam::{DMat2, DVec2};

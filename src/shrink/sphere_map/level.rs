@@ -192,9 +192,16 @@ impl Level {
         })
     }
 
-    /// One sweep of Newton steps over all vertices, colour by colour; returns by how much the energy fell.
-    pub fn sweep(&self, places: &mut [DVec3], objective: &Objective, settings: &Settings<'_>) -> Result<f64, Canceled> {
-        let mut fallen = 0.0;
+    /// One sweep of Newton steps over all vertices, colour by colour; returns by how much the energy fell. Where that of a vertex
+    /// fell by more than `notable`, it and its ring go on stepping.
+    pub fn sweep(
+        &self,
+        places: &mut [DVec3],
+        objective: &Objective,
+        notable: f64,
+        settings: &Settings<'_>,
+    ) -> Result<f64, Canceled> {
+        let (mut fallen, mut moving) = (0.0, Vec::new());
         for colour in &self.colours {
             settings.cancel.check()?;
             let relax = |star: &mut Star, v: u32| {
@@ -213,9 +220,38 @@ impl Level {
                     places[v as usize] = step.to;
                     // an energy that was infinite falls by infinity
                     fallen += step.before - step.after;
+                    if step.before - step.after > notable {
+                        moving.push(v);
+                    }
                 }
             }
         }
-        Ok(fallen)
+        Ok(fallen + self.follow(moving, places, objective, notable))
+    }
+
+    /// Steps of a few vertices, and of the rings of those that gain more than `notable`, until none does.
+    fn follow(&self, mut moving: Vec<u32>, places: &mut [DVec3], objective: &Objective, notable: f64) -> f64 {
+        const ROUNDS: u32 = 50;
+        let (mut star, mut fallen, mut seen) =
+            (Star::default(), 0.0, vec![0; if moving.is_empty() { 0 } else { self.len() }]);
+        for round in 1..=ROUNDS {
+            let mut next = Vec::new();
+            moving.sort_unstable();
+            for &v in &moving {
+                self.gather(v as usize, places, &mut star);
+                let Some(step) = star.relax(places[v as usize], objective) else { continue };
+                places[v as usize] = step.to;
+                fallen += step.before - step.after;
+                if step.before - step.after > notable {
+                    let around = self.ring(v as usize).iter().chain([&v]);
+                    next.extend(around.filter(|&&u| std::mem::replace(&mut seen[u as usize], round) < round));
+                }
+            }
+            moving = next;
+            if moving.is_empty() {
+                break;
+            }
+        }
+        fallen
     }
 }
