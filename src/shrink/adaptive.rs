@@ -35,8 +35,6 @@ struct Attempt {
     rise: f64,
     /// Factor on the density around the places where the attempt before went wrong.
     insist: f64,
-    /// Factor on the weight of areas: where all else failed, limbs that are left thinly sampled are better than twisted ones.
-    area: f64,
     /// Where its share of the progress starts and ends.
     share: (f32, f32),
 }
@@ -49,7 +47,6 @@ const ATTEMPTS: [Attempt; 3] = [
         denser: 4,
         rise: 2.0,
         insist: 1.0,
-        area: 1.0,
         share: (0.0, 0.7),
     },
     Attempt {
@@ -59,7 +56,6 @@ const ATTEMPTS: [Attempt; 3] = [
         denser: 6,
         rise: 2.0,
         insist: 1.2,
-        area: 1.0,
         share: (0.7, 0.9),
     },
     Attempt {
@@ -69,7 +65,6 @@ const ATTEMPTS: [Attempt; 3] = [
         denser: 6,
         rise: 3.0,
         insist: 3.0,
-        area: 0.5,
         share: (0.9, 1.0),
     },
 ];
@@ -141,7 +136,6 @@ fn one(
     let wanting: Vec<DVec3> = places.iter().map(|&p| frame.from_scene(p)).collect();
     denser_at(&mesh, &wanting, attempt.insist, &mut sampling.density);
     let mut objective = spec.distortion.objective();
-    objective.area *= attempt.area;
     let directions = sphere_map(&mesh, &sampling, objective, &settings)?.ok_or(ShrinkError::Unmapped)?;
     let mut map = match suits_cells(spec) {
         false => settled(&mesh, directions, &sampling, objective, &settings)?,

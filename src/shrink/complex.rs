@@ -98,15 +98,15 @@ fn bits(mut set: u64) -> impl Iterator<Item = usize> {
 }
 
 /// A node's neighbours, and the edges of its link.
-#[derive(Clone, Debug, Default)]
-pub struct Ring {
+#[derive(Clone, Copy, Debug)]
+pub struct Ring<'a> {
     /// The neighbours.
-    pub nodes: Vec<u32>,
+    pub nodes: &'a [u32],
     /// For every neighbour the set of the others (a bit each) that an edge of the link joins it to.
-    pub links: Vec<u64>,
+    pub links: &'a [u64],
 }
 
-impl Ring {
+impl Ring<'_> {
     /// Whether the node can change sides without a change of topology: what is inside of its link and what is outside are
     /// both in one piece (Bertrand 1994; the link is a sphere, so one piece each makes both a disc).
     pub fn simple(&self, inside: &[bool]) -> bool {
@@ -132,7 +132,9 @@ pub struct Rings<'a> {
     complex: &'a Complex,
     /// For every node its number in the ring that is being made; others have [`NONE`].
     numbers: Vec<u8>,
-    ring: Ring,
+    /// What the last ring was made of.
+    nodes: Vec<u32>,
+    links: Vec<u64>,
 }
 
 const NONE: u8 = u8::MAX;
@@ -140,15 +142,15 @@ const NONE: u8 = u8::MAX;
 impl<'a> Rings<'a> {
     /// For the nodes of a complex.
     pub fn new(complex: &'a Complex) -> Self {
-        Self { complex, numbers: vec![NONE; complex.len()], ring: Ring::default() }
+        Self { complex, numbers: vec![NONE; complex.len()], nodes: Vec::new(), links: Vec::new() }
     }
 
     /// The ring of a node.
     ///
     /// # Panics
     /// If it has more than 64 neighbours; on a graded lattice none has more than 26.
-    pub fn of(&mut self, v: usize) -> &Ring {
-        let Ring { nodes, links } = &mut self.ring;
+    pub fn of(&mut self, v: usize) -> Ring<'_> {
+        let Self { nodes, links, .. } = self;
         nodes.clear();
         links.clear();
         for t in self.complex.star(v) {
@@ -175,7 +177,40 @@ impl<'a> Rings<'a> {
         for &u in nodes.iter() {
             self.numbers[u as usize] = NONE;
         }
-        &self.ring
+        Ring { nodes: &self.nodes, links: &self.links }
+    }
+}
+
+/// Rings of nodes that are asked for again and again, each made once.
+pub struct Kept<'a> {
+    rings: Rings<'a>,
+    /// Number of every node's ring here; others have `u32::MAX`.
+    numbers: Vec<u32>,
+    /// Where every ring starts; one longer than there are rings.
+    first: Vec<u32>,
+    nodes: Vec<u32>,
+    links: Vec<u64>,
+}
+
+impl<'a> Kept<'a> {
+    /// For the nodes of a complex.
+    pub fn new(complex: &'a Complex) -> Self {
+        let numbers = vec![u32::MAX; complex.len()];
+        Self { rings: Rings::new(complex), numbers, first: vec![0], nodes: Vec::new(), links: Vec::new() }
+    }
+
+    /// The ring of a node.
+    pub fn of(&mut self, v: usize) -> Ring<'_> {
+        if self.numbers[v] == u32::MAX {
+            let ring = self.rings.of(v);
+            self.nodes.extend_from_slice(ring.nodes);
+            self.links.extend_from_slice(ring.links);
+            self.numbers[v] = self.first.len() as u32 - 1;
+            self.first.push(self.nodes.len() as u32);
+        }
+        let number = self.numbers[v] as usize;
+        let range = self.first[number] as usize..self.first[number + 1] as usize;
+        Ring { nodes: &self.nodes[range.clone()], links: &self.links[range] }
     }
 }
 
@@ -252,7 +287,8 @@ mod tests {
     #[test]
     fn a_node_is_simple_if_both_sides_of_its_link_are_in_one_piece() {
         // an octahedron's six corners around a node, opposite ones 0 and 1, 2 and 3, 4 and 5
-        let ring = Ring { nodes: (0..6).collect(), links: (0..6).map(|k| 0b11_1111 & !(0b11 << (k & !1))).collect() };
+        let (nodes, links) = ([0, 1, 2, 3, 4, 5], [0u64, 1, 2, 3, 4, 5].map(|k| 0b11_1111 & !(0b11 << (k & !1))));
+        let ring = Ring { nodes: &nodes, links: &links };
         let simple = |set: [usize; 6]| ring.simple(&set.map(|s| s == 1));
         assert!(simple([1, 0, 0, 0, 0, 0]) && simple([1, 0, 1, 0, 1, 0]) && simple([1, 1, 1, 0, 1, 1]));
         assert!(!simple([1; 6]) && !simple([0; 6]));

@@ -1,13 +1,14 @@
 //! Topology-keeping contraction: a ball on a graded lattice gives up its outermost simple nodes, in order of distance,
 //! until only the solid is left. Because only simple nodes go, the front stays one sphere.
 
-use super::complex::{Complex, Ring, Rings as Links};
+use super::complex::{Complex, Kept, Rings as Links};
 use super::graded::Graded;
 use super::rings::{Mesh, Rings};
 use super::{ShrinkError, topology};
 use crate::field::{Frame, Metric, Sampler};
 use crate::settings::{CancelToken, Canceled};
 use glam::DVec3;
+use rayon::prelude::*;
 use std::collections::HashMap;
 
 /// Cells along the longest side of the first lattice; each level halves them near the zero level set.
@@ -217,6 +218,8 @@ fn thin(
     what: Thin,
     narrow: &mut [bool],
 ) -> Result<Vec<(usize, DVec3)>, Canceled> {
+    /// Nodes worth a piece of parallel work.
+    const CHUNK: usize = 2048;
     /// Interpolation across a cell can be this wrong, in spacings.
     const SLACK: f64 = 0.3;
     /// The solid beside a gap is at least this thick, in spacings: nothing is opened into a thin wall.
@@ -225,13 +228,11 @@ fn thin(
     const WITHIN: [f64; 5] = [0.03, 0.1, 0.25, 0.5, 1.0];
     // seen from the other side a gap is a wall
     let sign = if what == Thin::Wall { 1.0 } else { -1.0 };
-    let mut rings = Links::new(complex);
-    let mut nodes = Vec::new();
-    for i in 0..complex.len() {
-        let (value, h) = (sign * f64::from(grid.values[i]), complex.spacing(i));
-        if !grid.known[i] || value <= 0.0 || value > THIN * h || complex.border[i] {
-            continue;
-        }
+    let beside = |i: usize| sign * f64::from(grid.values[i]);
+    let near =
+        |&i: &usize| grid.known[i] && beside(i) > 0.0 && beside(i) <= THIN * complex.spacing(i) && !complex.border[i];
+    let candidate = |rings: &mut Links<'_>, i: usize| {
+        let (value, h) = (beside(i), complex.spacing(i));
         let here = complex.positions[i];
         let slope: DVec3 = rings
             .of(i)
@@ -244,10 +245,15 @@ fn thin(
             .sum();
         let downhill = sign * slope.normalize_or_zero();
         let below = grid.interpolate(here - downhill * (value + PROBE * h)).map(|b| sign * b);
-        if downhill == DVec3::ZERO || below.is_none_or(|b| b > -(SOLID + SLACK) * h) {
-            nodes.push(i);
-        }
-    }
+        downhill == DVec3::ZERO || below.is_none_or(|b| b > -(SOLID + SLACK) * h)
+    };
+    let nodes: Vec<usize> = (0..complex.len()).filter(near).collect();
+    let chosen = |nodes: &[usize]| {
+        let mut rings = Links::new(complex);
+        nodes.iter().copied().filter(|&i| candidate(&mut rings, i)).collect()
+    };
+    let pieces: Vec<Vec<usize>> = sampler.settings().pool.install(|| nodes.par_chunks(CHUNK).map(chosen).collect());
+    let nodes = pieces.concat();
     let points: Vec<DVec3> = nodes.iter().map(|&i| complex.positions[i]).collect();
     let (values, gradients) = sampler.gradients(&points)?;
     let mut feet = Vec::with_capacity(nodes.len());
@@ -326,10 +332,9 @@ pub(super) fn carve(complex: &Complex, values: &[f32], cancel: &CancelToken) -> 
     let top = values.iter().fold(f32::MIN_POSITIVE, |a, &b| a.max(b));
     let bucket = |v: f32| ((v / top * (BUCKETS - 1) as f32) as usize).min(BUCKETS - 1);
     let mut queue: Vec<Vec<u32>> = vec![Vec::new(); BUCKETS];
-    let mut rings = Links::new(complex);
-    let mut kept: Vec<Option<Box<Ring>>> = vec![None; complex.len()];
+    let mut rings = Kept::new(complex);
     for i in (0..complex.len()).filter(|&i| complex.border[i]) {
-        for &j in &rings.of(i).nodes {
+        for &j in rings.of(i).nodes {
             if inside[j as usize] && values[j as usize] > 0.0 {
                 queue[bucket(values[j as usize])].push(j);
             }
@@ -352,12 +357,12 @@ pub(super) fn carve(complex: &Complex, values: &[f32], cancel: &CancelToken) -> 
         if !inside[i] {
             continue;
         }
-        let ring = kept[i].get_or_insert_with(|| Box::new(rings.of(i).clone()));
+        let ring = rings.of(i);
         if !ring.simple(&inside) {
             continue;
         }
         inside[i] = false;
-        for &j in &ring.nodes {
+        for &j in ring.nodes {
             if inside[j as usize] && values[j as usize] > 0.0 {
                 let b = bucket(values[j as usize]);
                 queue[b].push(j);
