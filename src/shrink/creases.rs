@@ -127,11 +127,13 @@ pub(super) fn least_squares(matrix: DMat3, right: DVec3) -> (DVec3, usize) {
 
 /// Eigenvalues and eigenvectors of a symmetric matrix by cyclic Jacobi rotations.
 fn symmetric_eigen(matrix: DMat3) -> (DVec3, DMat3) {
+    /// What is smaller than this beside the diagonal changes nothing.
+    const NONE: f64 = 1e-18;
     let (mut a, mut vectors) = (matrix, DMat3::IDENTITY);
     for _ in 0..12 {
         for (p, q) in [(0, 1), (0, 2), (1, 2)] {
             let off = a.col(p)[q];
-            if off.abs() < 1e-300 {
+            if off.abs() <= NONE * (a.col(p)[p].abs() + a.col(q)[q].abs()) {
                 continue;
             }
             let theta = (a.col(q)[q] - a.col(p)[p]) / (2.0 * off);

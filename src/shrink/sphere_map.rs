@@ -44,7 +44,7 @@ struct Steps {
     most: usize,
 }
 const NEWTON: Steps = Steps { work: 5_000, fewest: 2, most: 40 };
-/// A descent at a growth. Far from the minimum a step that is known better is not a longer one: the barriers stop it.
+/// A descent at a growth.
 const COARSE: Effort = Effort { steps: 0, products: 40, tolerance: 1e-3 };
 /// The last descent.
 const FINE: Effort = Effort { steps: 24, products: 40, tolerance: 2e-4 };
@@ -365,10 +365,11 @@ impl Inserter<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::measure::fixtures::with_settings;
     use crate::settings::Progress;
 
     /// A sphere of `rows` x `columns` with a limb of this length drawn out of its top.
-    fn limb(rows: usize, columns: usize, length: f64) -> Mesh {
+    pub(super) fn limb(rows: usize, columns: usize, length: f64) -> Mesh {
         let mut positions = vec![DVec3::new(0.0, 0.0, 1.0 + length)];
         for row in 1..rows {
             let polar = PI * row as f64 / rows as f64;
@@ -401,9 +402,9 @@ mod tests {
         Mesh { positions, rings }
     }
 
-    const ISOMETRIC: Objective = Objective { isometry: 1.0, area: 1.0, angle: 0.0 };
+    pub(super) const ISOMETRIC: Objective = Objective { isometry: 1.0, area: 1.0, angle: 0.0 };
 
-    fn map(mesh: &Mesh, objective: Objective, threads: usize) -> (Vec<DVec3>, Descent) {
+    pub(super) fn map(mesh: &Mesh, objective: Objective, threads: usize) -> (Vec<DVec3>, Descent) {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let cancel = CancelToken::new();
         let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_: Progress| {} };
@@ -455,31 +456,51 @@ mod tests {
         assert_eq!(map(&mesh, ISOMETRIC, 1).0, map(&mesh, ISOMETRIC, 7).0);
     }
 
+    /// A mesh with a map that is a bijection, and a bad one: the direction from inside the limb's foot.
+    pub(super) fn bad(mesh: &Mesh, settings: &Settings<'_>) -> (Level, Vec<DVec3>) {
+        let sampling = Sampling::even(mesh.positions.len());
+        let shapes = Shapes::new(mesh, &sampling);
+        let vertices: Vec<u32> = (0..mesh.positions.len() as u32).collect();
+        let level =
+            Level::new(vertices, mesh.positions.len(), |v| mesh.rings.ring(v), |t| shapes.reference(t), settings);
+        (level, mesh.positions.iter().map(|p| (*p - 0.5 * DVec3::Z).normalize()).collect())
+    }
+
     #[test]
     fn sweeps_and_newton_steps_never_raise_the_energy() {
         let mesh = limb(30, 30, 3.0);
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-        let cancel = CancelToken::new();
-        let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_: Progress| {} };
-        let sampling = Sampling::even(mesh.positions.len());
-        let shapes = Shapes::new(&mesh, &sampling);
-        let vertices: Vec<u32> = (0..mesh.positions.len() as u32).collect();
-        let level =
-            Level::new(vertices, mesh.positions.len(), |v| mesh.rings.ring(v), |t| shapes.reference(t), &settings);
-        // the direction from inside the limb's foot is a bijection, and a bad one
-        let mut places: Vec<DVec3> = mesh.positions.iter().map(|p| (*p - 0.5 * DVec3::Z).normalize()).collect();
-        let mut last = level.energy(&places, &ISOMETRIC, &settings);
-        for round in 0..12 {
-            if round % 2 == 0 {
-                level.sweep(&mut places, &ISOMETRIC, f64::INFINITY, &settings).unwrap();
-            } else {
-                descend(&level, &mut places, &ISOMETRIC, Effort { steps: 1, products: 30, tolerance: 0.0 }, &settings)
-                    .unwrap();
+        with_settings(1, |settings| {
+            let (level, mut places) = bad(&mesh, settings);
+            let mut last = level.energy(&places, &ISOMETRIC, settings);
+            for round in 0..12 {
+                if round % 2 == 0 {
+                    level.sweep(&mut places, &ISOMETRIC, f64::INFINITY, settings).unwrap();
+                } else {
+                    let effort = Effort { steps: 1, products: 30, tolerance: 0.0 };
+                    descend(&level, &mut places, &ISOMETRIC, effort, settings).unwrap();
+                }
+                let energy = level.energy(&places, &ISOMETRIC, settings);
+                assert!(energy <= last + 1e-9 * last, "{last} -> {energy} in round {round}");
+                last = energy;
             }
-            let energy = level.energy(&places, &ISOMETRIC, &settings);
-            assert!(energy <= last + 1e-9 * last, "{last} -> {energy} in round {round}");
-            last = energy;
-        }
-        assert!(last.is_finite());
+            assert!(last.is_finite());
+        });
+    }
+
+    #[test]
+    fn a_sweep_follows_what_still_moves() {
+        let mesh = limb(30, 30, 3.0);
+        with_settings(1, |settings| {
+            let (level, places) = bad(&mesh, settings);
+            let fallen = |notable: f64| {
+                let mut places = places.clone();
+                let before = level.energy(&places, &ISOMETRIC, settings);
+                let told = level.sweep(&mut places, &ISOMETRIC, notable, settings).unwrap();
+                let fallen = before - level.energy(&places, &ISOMETRIC, settings);
+                assert!((told - fallen).abs() < 1e-9 * before, "told {told}, fell by {fallen}");
+                fallen
+            };
+            assert!(fallen(0.0) > 1.2 * fallen(f64::INFINITY), "{} {}", fallen(0.0), fallen(f64::INFINITY));
+        });
     }
 }

@@ -212,3 +212,39 @@ fn determinant(level: &Level, places: &[DVec3], t: usize) -> f64 {
     let [a, b, c] = level.triangles[t].map(|v| places[v as usize]);
     a.dot(b.cross(c))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::{ISOMETRIC, bad, limb, map};
+    use super::*;
+    use crate::measure::fixtures::with_settings;
+
+    #[test]
+    fn triangles_that_a_step_would_turn_over_are_made_stiffer() {
+        const PRODUCTS: usize = 200;
+        let mesh = limb(40, 30, 8.0);
+        with_settings(1, |settings| {
+            let (level, _) = bad(&mesh, settings);
+            // a good map, drawn together at the limb's tip
+            let (good, _) = map(&mesh, ISOMETRIC, 1);
+            let mut places: Vec<DVec3> = good.iter().map(|d| (*d + 0.95 * DVec3::Z).normalize()).collect();
+            let (mut plain, mut stiffened) = (0, 0);
+            for _ in 0..8 {
+                let mut step = Step::new(&level, &places, &ISOMETRIC, PRODUCTS, settings).unwrap();
+                let flat = |step: &Step<'_>| (0..level.triangles.len()).filter(|&t| step.share(t) < 1.0).count();
+                stiffened += flat(&step);
+                let (to, _) = step.search(level.energy(&places, &ISOMETRIC, settings)).expect("a better map");
+                let triangle = |t: usize| {
+                    let corners = level.triangles[t].map(|v| v as usize);
+                    Triangle::new(corners, &places, &step.frames, &level.shapes[t], &ISOMETRIC)
+                };
+                let triangles: Vec<Triangle> = (0..level.triangles.len()).map(triangle).collect();
+                let system = System::new(&level, &triangles, settings);
+                step.direction = system.solve(&level, PRODUCTS, None, settings).unwrap().0;
+                plain += flat(&step);
+                places = to;
+            }
+            assert!(plain > 0 && 2 * stiffened < plain, "{stiffened} of {plain}");
+        });
+    }
+}
