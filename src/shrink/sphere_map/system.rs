@@ -86,9 +86,9 @@ impl System {
         pieces.into_iter().sum()
     }
 
-    /// A direction of descent and the products it took: conjugate gradients with the diagonal blocks as preconditioner, from
-    /// `start` where there is one, stopped early: where the residual is small enough for the gradient that is left, or where the
-    /// Hessian curves downwards.
+    /// A direction of descent and the products it took, but for that of `start`: conjugate gradients with the diagonal blocks
+    /// as preconditioner, from `start` where there is one, stopped early: where the residual is small enough for the gradient
+    /// that is left, or where the Hessian curves downwards.
     pub fn solve(
         &self,
         level: &Level,
