@@ -221,12 +221,19 @@ pub enum ShrinkError {
         /// Largest value that was seen.
         max: f64,
     },
-    /// The zero level set has several components.
-    #[error("the zero level set has {count} components, and one can be wrapped")]
+    /// The zero level set has several components: solids apart from each other, or voids in them.
+    #[error(
+        "the zero level set has {} components ({}), and one can be wrapped: `component` chooses a solid{}",
+        .solids + .voids,
+        listed(&[(*.solids, "solid"), (*.voids, "void")]),
+        if *.voids > 0 { " and fills its voids" } else { "" }
+    )]
     Components {
-        /// How many were found.
-        count: usize,
-        /// Scene positions, one inside each, largest first; at most 16.
+        /// Solids that were found.
+        solids: usize,
+        /// Voids that were found.
+        voids: usize,
+        /// Scene positions, one inside each solid, largest first, then one inside each void; at most 16.
         places: Vec<[f64; 3]>,
     },
     /// The component that was asked for is not there.
@@ -240,7 +247,10 @@ pub enum ShrinkError {
         places: Vec<[f64; 3]>,
     },
     /// The zero level set has handles.
-    #[error("the zero level set has genus {genus} (so many handles), and only genus 0 can be wrapped")]
+    #[error(
+        "the zero level set has genus {genus} (so many handles), and only genus 0 can be wrapped: `on_topology: wrap` closes \
+         handles"
+    )]
     Genus {
         /// Number of handles.
         genus: usize,
@@ -248,7 +258,10 @@ pub enum ShrinkError {
         places: Vec<[f64; 3]>,
     },
     /// The zero level set of a field of dimension 2 has holes: the plane's kind of handles.
-    #[error("the solid in the plane has {count} {}, and only one without holes is followed", if *.count == 1 { "hole" } else { "holes" })]
+    #[error(
+        "the solid in the plane has {}, and only one without holes is followed: `on_topology: wrap` goes around it",
+        listed(&[(*.count, "hole")])
+    )]
     Holes {
         /// Number of holes.
         count: usize,
@@ -269,6 +282,13 @@ pub enum ShrinkError {
         /// The dimension that is needed.
         wanted: u8,
     },
+}
+
+/// How many there are of what, leaving out what there is none of: "2 solids and 1 void".
+fn listed(counts: &[(usize, &str)]) -> String {
+    let there = counts.iter().filter(|(count, _)| *count > 0);
+    let words = there.map(|(count, what)| format!("{count} {what}{}", if *count == 1 { "" } else { "s" }));
+    words.collect::<Vec<_>>().join(" and ")
 }
 
 impl ShrinkError {

@@ -55,7 +55,10 @@ fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
     let asked = |outputs| Asked { shrink: &shrink, budget, outputs, load_seconds };
     let ended = |ended: Ended| match ended {
         Ended::Failed(failure) if failure.is_bad_input() => (BAD_INPUT, in_field(&failure.detail)),
-        Ended::Failed(failure) => (NOT_WRAPPED, in_field(&format!("{} ({})", failure.detail, failure.code))),
+        Ended::Failed(failure) => {
+            let Failure { detail, code, places, .. } = *failure;
+            (NOT_WRAPPED, in_field(&finding("", &Finding { code, detail, places })))
+        }
         Ended::Canceled => (FAILED, "canceled".to_owned()),
     };
     if opened.field.dimension() == 2 {

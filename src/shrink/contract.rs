@@ -502,6 +502,10 @@ mod tests {
         assert!(matches!(contracted(torus, FIRST, &[]), Err(ShrinkError::Genus { genus: 1, .. })));
         let ball = |x: f64| json!({"translate": {"by": [x, 0, 0], "of": {"sphere": {"radius": 0.25}}}});
         let two = json!({"union": {"of": [ball(-0.5), ball(0.5)]}});
-        assert!(matches!(contracted(two, FIRST, &[]), Err(ShrinkError::Components { count: 2, .. })));
+        assert!(matches!(contracted(two, FIRST, &[]), Err(ShrinkError::Components { solids: 2, voids: 0, .. })));
+        let hollow = json!({"difference": {"of": [{"sphere": {"radius": 0.7}}, {"sphere": {"radius": 0.3}}]}});
+        let Err(refusal) = contracted(hollow, FIRST, &[]) else { panic!("it has a void") };
+        assert!(refusal.to_string().contains("2 components (1 solid and 1 void)"), "{refusal}");
+        assert_eq!(refusal.places().len(), 2);
     }
 }

@@ -221,7 +221,7 @@ fn chosen(mut loops: Vec<Loop>, spec: &CurveSpec, frame: Frame) -> Result<(Loop,
         let (count, places) = (parts.len(), places(&mut parts.iter().map(|p| p.outer), -1.0));
         return Err(match spec.component {
             Some(Component::Index(index)) => ShrinkError::NoComponent { index, count, places },
-            _ => ShrinkError::Components { count, places },
+            _ => ShrinkError::Components { solids: count, voids: 0, places },
         });
     };
     if !part.holes.is_empty() && spec.on_topology == OnTopology::Refuse {

@@ -21,7 +21,7 @@ pub fn explain(complex: &Complex, far: &[bool], inside: &[bool], frame: Frame) -
     let place = |cluster: &Vec<usize>| middle(complex, cluster, frame);
     if bodies.len() + voids.len() > 1 {
         let places = bodies.iter().chain(&voids).take(PLACES).map(place).collect();
-        return Err(ShrinkError::Components { count: bodies.len() + voids.len(), places });
+        return Err(ShrinkError::Components { solids: bodies.len(), voids: voids.len(), places });
     }
     let genus = 1 - complex.euler(&solid);
     if genus > 0 {

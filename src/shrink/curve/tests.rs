@@ -138,7 +138,7 @@ fn a_rounding_is_no_corner_however_small() {
 #[test]
 fn a_zero_set_that_is_not_one_loop_is_refused_with_its_places() {
     let two = json!({"union": {"of": [disc(0.3, [-0.5, 0.0]), disc(0.2, [0.5, 0.0])]}});
-    let Err(ShrinkError::Components { count: 2, places }) = adaptive_curve(&two, 100) else { panic!() };
+    let Err(ShrinkError::Components { solids: 2, voids: 0, places }) = adaptive_curve(&two, 100) else { panic!() };
     assert!((places[0][0] + 0.5).hypot(places[0][1]) < 0.3 && (places[1][0] - 0.5).hypot(places[1][1]) < 0.2);
     let ring = json!({"shell": {"thickness": 0.1, "of": {"circle": {"radius": 0.5}}}});
     let Err(ShrinkError::Holes { count: 1, places }) = adaptive_curve(&ring, 100) else { panic!() };
