@@ -13,6 +13,7 @@ mod evaluate;
 mod functions;
 pub mod niq;
 pub mod safetensors;
+pub mod tensors;
 pub(in crate::field) mod zip;
 
 pub use activation::Activation;
