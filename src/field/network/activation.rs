@@ -88,7 +88,7 @@ impl Activation {
             }
             Self::Relu => each(row, derivative, |x| if x > 0.0 { (x, 1.0) } else { (0.0, 0.0) }),
             Self::Elu => each(row, derivative, |x| {
-                let e = exp(x);
+                let e = flushed(exp(x));
                 if x > 0.0 { (x, 1.0) } else { (e - 1.0, e) }
             }),
             Self::Tanh => each(row, derivative, |x| {
@@ -96,14 +96,14 @@ impl Activation {
                 (t, 1.0 - t * t)
             }),
             Self::Sigmoid => each(row, derivative, |x| {
-                let s = sigmoid(x);
+                let s = flushed(sigmoid(x));
                 (s, s * (1.0 - s))
             }),
             Self::Softplus { beta } => {
                 let inverse = 1.0 / beta;
                 each(row, derivative, |x| {
                     let t = beta * x;
-                    let e = exp(-t.abs());
+                    let e = flushed(exp(-t.abs()));
                     let positive = if x > 0.0 { x } else { 0.0 };
                     let slope = 1.0 / (1.0 + e);
                     (positive + ln_1p(e) * inverse, if x > 0.0 { slope } else { e * slope })
@@ -126,6 +126,13 @@ impl Activation {
             }
         }
     }
+}
+
+/// Zero for what is positive and next to nothing: products of such numbers leave the range in which a processor is fast.
+#[inline(always)]
+fn flushed(x: f32) -> f32 {
+    const NOTHING: f32 = 1e-18;
+    if x > NOTHING { x } else { 0.0 }
 }
 
 #[cold]

@@ -1,0 +1,283 @@
+//! Matrix products of a layer's weights with blocks of points: a register-blocked kernel over weights that are packed once.
+//!
+//! Points come in tiles of [`TILE`]. A block of numbers holds, tile after tile, one row of [`TILE`] numbers per feature, and as many
+//! rows of nothing as make the number of rows a multiple of [`ROWS`]. Weights are packed in panels of [`ROWS`] rows, column after
+//! column, so the kernel reads both from beginning to end: per column it takes [`ROWS`] weights and a row of points to
+//! `ROWS * TILE` sums that stay in registers.
+//!
+//! Every sum is made in the order of the columns with fused multiply-adds, by every version of the kernel: a point gets the same
+//! bits in every tile, and on every processor that has the instruction.
+
+/// Points in a tile: three registers of AVX-512.
+pub(super) const TILE: usize = 48;
+/// Rows of weights in a panel: with [`TILE`] they fill 24 of the 32 registers with sums.
+pub(super) const ROWS: usize = 8;
+/// Numbers of a panel's product with a tile.
+const SUMS: usize = ROWS * TILE;
+
+/// The number of rows that so many features take up.
+pub(super) fn padded(features: usize) -> usize {
+    features.next_multiple_of(ROWS)
+}
+
+/// A matrix packed for the kernel.
+pub(super) struct Panels {
+    rows: usize,
+    columns: usize,
+    packed: Vec<f32>,
+}
+
+impl Panels {
+    /// The matrix of `rows` times `columns` numbers that `at(row, column)` gives.
+    pub fn new(rows: usize, columns: usize, at: impl Fn(usize, usize) -> f32) -> Self {
+        let mut packed = Vec::with_capacity(padded(rows) * columns);
+        for first in (0..rows).step_by(ROWS) {
+            for column in 0..columns {
+                packed.extend((first..first + ROWS).map(|row| if row < rows { at(row, column) } else { 0.0 }));
+            }
+        }
+        Self { rows, columns, packed }
+    }
+
+    /// Whether there is nothing to multiply with.
+    pub fn is_empty(&self) -> bool {
+        self.columns == 0
+    }
+
+    fn panel(&self, index: usize) -> &[f32] {
+        &self.packed[index * self.columns * ROWS..][..self.columns * ROWS]
+    }
+}
+
+/// What a product is added to.
+#[derive(Clone, Copy)]
+pub(super) enum Start<'a> {
+    /// Nothing.
+    Zero,
+    /// One number per row, and zeros for the padding.
+    Bias(&'a [f32]),
+    /// What is there.
+    There,
+}
+
+/// The sum of the products of some matrices, all with as many rows, with one block of `tiles` tiles each, into `to`. Every piece
+/// of `to` is shown to `finish`, with its place, as soon as it is done.
+pub(super) fn multiply(
+    parts: &[(&Panels, &[f32])],
+    tiles: usize,
+    start: Start<'_>,
+    to: &mut [f32],
+    mut finish: impl FnMut(usize, &mut [f32]),
+) {
+    let rows = padded(parts.iter().map(|(panels, _)| panels.rows).max().unwrap_or(0));
+    assert_eq!(to.len(), tiles * rows * TILE);
+    for (panels, from) in parts {
+        assert!(padded(panels.rows) == rows && from.len() == tiles * padded(panels.columns) * TILE);
+    }
+    let kernel = Kernel::detect();
+    for panel in 0..rows / ROWS {
+        for tile in 0..tiles {
+            let at = (tile * rows + panel * ROWS) * TILE;
+            let sums: &mut [f32; SUMS] = (&mut to[at..at + SUMS]).try_into().expect("a slice of that length");
+            match start {
+                Start::Zero => sums.fill(0.0),
+                Start::Bias(bias) => {
+                    for (row, bias) in sums.chunks_exact_mut(TILE).zip(&bias[panel * ROWS..]) {
+                        row.fill(*bias);
+                    }
+                }
+                Start::There => {}
+            }
+            for (panels, from) in parts {
+                let features = &from[tile * padded(panels.columns) * TILE..][..panels.columns * TILE];
+                kernel.add(panels.panel(panel), features, sums);
+            }
+            finish(at, sums);
+        }
+    }
+}
+
+/// A version of the kernel that this processor can run.
+#[derive(Clone, Copy)]
+enum Kernel {
+    #[cfg(target_arch = "x86_64")]
+    Avx512,
+    #[cfg(target_arch = "x86_64")]
+    Avx2,
+    Plain,
+}
+
+impl Kernel {
+    fn detect() -> Self {
+        #[cfg(target_arch = "x86_64")]
+        {
+            if std::is_x86_feature_detected!("avx512f") {
+                return Self::Avx512;
+            }
+            if std::is_x86_feature_detected!("avx2") && std::is_x86_feature_detected!("fma") {
+                return Self::Avx2;
+            }
+        }
+        Self::Plain
+    }
+
+    /// Adds the product of a panel with a tile's features to `sums`.
+    fn add(self, panel: &[f32], features: &[f32], sums: &mut [f32; SUMS]) {
+        assert_eq!(panel.len() / ROWS, features.len() / TILE);
+        match self {
+            // SAFETY: `detect` saw that the processor has the features that the function asks for.
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512 => unsafe { add_avx512(panel, features, sums) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2 => unsafe { add_avx2(panel, features, sums) },
+            Self::Plain => add_plain(panel, features, sums),
+        }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f")]
+fn add_avx512(panel: &[f32], features: &[f32], sums: &mut [f32; SUMS]) {
+    use std::arch::x86_64::{__m512, _mm512_fmadd_ps, _mm512_loadu_ps, _mm512_set1_ps, _mm512_storeu_ps};
+    const LANES: usize = 16;
+    const WIDE: usize = TILE / LANES;
+    // SAFETY: reads 16 numbers at most 16 before the end of a chunk of TILE or SUMS numbers.
+    let load = |row: &[f32], j: usize| -> __m512 { unsafe { _mm512_loadu_ps(row[j * LANES..][..LANES].as_ptr()) } };
+    let mut sum: [[__m512; WIDE]; ROWS] = std::array::from_fn(|i| std::array::from_fn(|j| load(&sums[i * TILE..], j)));
+    for (weights, points) in panel.chunks_exact(ROWS).zip(features.chunks_exact(TILE)) {
+        let points: [__m512; WIDE] = std::array::from_fn(|j| load(points, j));
+        for i in 0..ROWS {
+            let weight = _mm512_set1_ps(weights[i]);
+            for j in 0..WIDE {
+                sum[i][j] = _mm512_fmadd_ps(weight, points[j], sum[i][j]);
+            }
+        }
+    }
+    for (row, sum) in sums.chunks_exact_mut(TILE).zip(sum) {
+        for (lanes, sum) in row.chunks_exact_mut(LANES).zip(sum) {
+            // SAFETY: `lanes` has as many numbers as the register.
+            unsafe { _mm512_storeu_ps(lanes.as_mut_ptr(), sum) };
+        }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn add_avx2(panel: &[f32], features: &[f32], sums: &mut [f32; SUMS]) {
+    use std::arch::x86_64::{__m256, _mm256_fmadd_ps, _mm256_loadu_ps, _mm256_set1_ps, _mm256_storeu_ps};
+    const LANES: usize = 8;
+    /// Of 16 registers, twelve hold sums of 4 rows and 24 points.
+    const WIDE: usize = 3;
+    const HIGH: usize = 4;
+    // SAFETY: reads the 8 numbers of a slice of that length.
+    let load = |row: &[f32], j: usize| -> __m256 { unsafe { _mm256_loadu_ps(row[j * LANES..][..LANES].as_ptr()) } };
+    for first in (0..ROWS).step_by(HIGH) {
+        for left in (0..TILE).step_by(WIDE * LANES) {
+            let mut sum: [[__m256; WIDE]; HIGH] =
+                std::array::from_fn(|i| std::array::from_fn(|j| load(&sums[(first + i) * TILE + left..], j)));
+            for (weights, points) in panel.chunks_exact(ROWS).zip(features.chunks_exact(TILE)) {
+                let points: [__m256; WIDE] = std::array::from_fn(|j| load(&points[left..], j));
+                for i in 0..HIGH {
+                    let weight = _mm256_set1_ps(weights[first + i]);
+                    for j in 0..WIDE {
+                        sum[i][j] = _mm256_fmadd_ps(weight, points[j], sum[i][j]);
+                    }
+                }
+            }
+            for (i, sum) in sum.into_iter().enumerate() {
+                for (j, sum) in sum.into_iter().enumerate() {
+                    let lanes = &mut sums[(first + i) * TILE + left + j * LANES..][..LANES];
+                    // SAFETY: `lanes` has as many numbers as the register.
+                    unsafe { _mm256_storeu_ps(lanes.as_mut_ptr(), sum) };
+                }
+            }
+        }
+    }
+}
+
+/// For processors without these instructions: the same sums.
+fn add_plain(panel: &[f32], features: &[f32], sums: &mut [f32; SUMS]) {
+    for (weights, points) in panel.chunks_exact(ROWS).zip(features.chunks_exact(TILE)) {
+        for (weight, row) in weights.iter().zip(sums.chunks_exact_mut(TILE)) {
+            for (sum, point) in row.iter_mut().zip(points) {
+                *sum = weight.mul_add(*point, *sum);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn number(i: usize) -> f32 {
+        ((i * 7919 + 13) % 1009) as f32 / 504.5 - 1.0
+    }
+
+    /// A product in f64, number by number.
+    fn plainly(rows: usize, columns: usize, from: &[f32], tile: usize, row: usize, point: usize) -> f64 {
+        let feature = |column: usize| from[(tile * padded(columns) + column) * TILE + point];
+        assert!(row < rows);
+        (0..columns).map(|k| f64::from(number(row * columns + k)) * f64::from(feature(k))).sum()
+    }
+
+    #[test]
+    fn products_of_any_shape_are_those_of_the_plain_loop_added_to_the_start() {
+        for (rows, columns) in [(1, 1), (8, 3), (9, 64), (1, 200), (130, 7)] {
+            let tiles = 3;
+            let panels = Panels::new(rows, columns, |i, j| number(i * columns + j));
+            let from: Vec<f32> = (0..tiles * padded(columns) * TILE).map(|i| number(i + 5)).collect();
+            let bias: Vec<f32> = (0..padded(rows)).map(number).collect();
+            let mut to = vec![0.5; tiles * padded(rows) * TILE];
+            for (start, first) in [(Start::There, None), (Start::Zero, Some(0.0)), (Start::Bias(&bias), None)] {
+                let before = to.clone();
+                let mut seen = 0;
+                multiply(&[(&panels, &from)], tiles, start, &mut to, |_, piece| seen += piece.len());
+                assert_eq!(seen, to.len(), "every piece is shown once");
+                for (tile, row, point) in
+                    (0..tiles).flat_map(|t| (0..rows).flat_map(move |r| (0..TILE).map(move |p| (t, r, p))))
+                {
+                    let at = (tile * padded(rows) + row) * TILE + point;
+                    let first = first.unwrap_or(match start {
+                        Start::Bias(bias) => bias[row],
+                        _ => before[at],
+                    });
+                    let expected = f64::from(first) + plainly(rows, columns, &from, tile, row, point);
+                    let error = (f64::from(to[at]) - expected).abs();
+                    assert!(error < 1e-6 * columns as f64, "{rows} x {columns}, row {row}: {error}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn two_matrices_are_added_up() {
+        let (one, two) = (Panels::new(5, 9, |i, j| number(i + 3 * j)), Panels::new(5, 2, |i, j| number(7 * i + j)));
+        let from: [Vec<f32>; 2] = [9, 2].map(|n| (0..padded(n) * TILE).map(|i| number(i + n)).collect());
+        let mut apart = vec![0.0; padded(5) * TILE];
+        multiply(&[(&one, &from[0])], 1, Start::Zero, &mut apart, |_, _| {});
+        multiply(&[(&two, &from[1])], 1, Start::There, &mut apart, |_, _| {});
+        let mut together = vec![0.0; padded(5) * TILE];
+        multiply(&[(&one, &from[0]), (&two, &from[1])], 1, Start::Zero, &mut together, |_, _| {});
+        assert_eq!(apart, together);
+    }
+
+    #[test]
+    fn every_version_of_the_kernel_gives_the_same_bits() {
+        let columns = 37;
+        let panel: Vec<f32> = (0..columns * ROWS).map(number).collect();
+        let features: Vec<f32> = (0..columns * TILE).map(|i| number(i + 3)).collect();
+        let with = |kernel: Kernel| {
+            let mut sums: [f32; SUMS] = std::array::from_fn(number);
+            kernel.add(&panel, &features, &mut sums);
+            sums
+        };
+        let plain = with(Kernel::Plain);
+        assert_eq!(with(Kernel::detect()), plain);
+        #[cfg(target_arch = "x86_64")]
+        if std::is_x86_feature_detected!("avx2") && std::is_x86_feature_detected!("fma") {
+            assert_eq!(with(Kernel::Avx2), plain);
+        }
+    }
+}
