@@ -338,13 +338,13 @@ pub fn shrink(
 }
 
 /// Repairs a wrap that a certificate complained about: the triangles at `places` (scene units) are shown to the field,
-/// and what is folded or crosses anywhere is moved apart. Returns the folded triangles and the crossing pairs that are
+/// and what is folded or crosses anywhere is moved apart, by other moves for every `seed`. Returns the folded triangles and the crossing pairs that are
 /// left, as far as they are seen.
 ///
 /// # Errors
 /// When the token is raised.
-pub fn mend(sampler: &Sampler<'_>, wrap: &mut Wrap, places: &[DVec3]) -> Result<(usize, usize), Canceled> {
+pub fn mend(sampler: &Sampler<'_>, wrap: &mut Wrap, places: &[DVec3], seed: u32) -> Result<(usize, usize), Canceled> {
     sampler.tally().stage("mend");
-    let left = separate::separate(sampler, wrap, &[], places)?;
+    let left = separate::separate(sampler, wrap, &[], places, seed)?;
     Ok((left.folds, left.crossings))
 }

@@ -191,7 +191,7 @@ fn one(
         gradients: at.gradients,
         diagonals,
     };
-    let left = separate(scene, &mut wrap, &[&to_scene(&blunt), &to_scene(&landed)], places)?;
+    let left = separate(scene, &mut wrap, &[&to_scene(&blunt), &to_scene(&landed)], places, 0)?;
     stage("separate", 1.0, None, None, Some(left.folds as u64));
     Ok(wrap)
 }

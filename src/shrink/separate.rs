@@ -89,12 +89,13 @@ struct Repair<'a> {
 
 /// Repairs a surface in scene units. `earlier` are positions that its vertices had before, any of which they may go back
 /// to. Triangles at `places` are shown to the field even if their corners do not doubt them. On return all positions are
-/// single-precision numbers. Returns what is left.
+/// single-precision numbers. Another `seed` tries other places. Returns what is left.
 pub fn separate(
     sampler: &Sampler<'_>,
     wrap: &mut Wrap,
     earlier: &[&[DVec3]],
     places: &[DVec3],
+    seed: u32,
 ) -> Result<Faults, Canceled> {
     /// Rounds of a cycle, which starts with smoothing what is bad, from the second cycle on.
     const CYCLE: usize = 3;
@@ -119,7 +120,7 @@ pub fn separate(
         changed: (0..triangles.len() as u32).collect(),
         state: State { at, diagonals: wrap.diagonals.clone(), triangles, along, targets },
         limit: OFF * diagonal,
-        random: Random::new(),
+        random: Random::new(seed),
     };
     repair.look_at(places)?;
     let mut found = repair.find()?;

@@ -151,13 +151,13 @@ fn centroid(positions: &[DVec3], t: [u32; 3]) -> DVec3 {
     t.iter().map(|&v| positions[v as usize]).sum::<DVec3>() / 3.0
 }
 
-/// A small generator with a fixed seed (splitmix64, Steele et al. 2014), so that results do not change from run to run.
+/// A small generator (splitmix64, Steele et al. 2014) with a seed that is given, so that results do not change from run to run.
 pub struct Random(u64);
 
 impl Random {
-    /// From the one seed there is.
-    pub fn new() -> Self {
-        Self(0x9e37_79b9_7f4a_7c15)
+    /// The sequence of this number.
+    pub fn new(seed: u32) -> Self {
+        Self(0x9e37_79b9_7f4a_7c15u64.wrapping_mul(1 + u64::from(seed)))
     }
     fn next(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);

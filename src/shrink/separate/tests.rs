@@ -59,7 +59,7 @@ fn sheets_that_went_through_a_thin_wall_come_apart_and_stay_near_it() {
                 wrap.positions[v].z = -1.3 * THICK;
             }
             assert!(crossing(sampler, &wrap) > 10);
-            let left = separate(sampler, &mut wrap, &[], &[]).unwrap();
+            let left = separate(sampler, &mut wrap, &[], &[], 0).unwrap();
             assert_eq!(left, Faults::default());
             assert_eq!(crossing(sampler, &wrap), 0);
             let limit = OFF * 8f64.sqrt();
@@ -76,7 +76,7 @@ fn a_fold_is_smoothed_out() {
         let mut wrap = pressed(sampler);
         let v = (0..wrap.positions.len()).find(|&v| wrap.positions[v].z > 0.0 && wrap.positions[v].x > 0.3).unwrap();
         wrap.positions[v].x += 0.2;
-        let left = separate(sampler, &mut wrap, &[], &[]).unwrap();
+        let left = separate(sampler, &mut wrap, &[], &[], 0).unwrap();
         assert_eq!((left, crossing(sampler, &wrap)), (Faults::default(), 0));
     });
 }
