@@ -14,6 +14,7 @@ mod functions;
 pub mod niq;
 pub mod safetensors;
 pub mod tensors;
+pub mod torch;
 pub(in crate::field) mod zip;
 
 pub use activation::Activation;
