@@ -36,6 +36,8 @@ pub const MAX_TENSORS: usize = 4096;
 const MAX_STORAGE_BYTES: usize = 4 * MAX_ELEMENTS;
 /// Most bytes of the pickle in an archive; that of a thousand tensors is some 200 KiB.
 const MAX_PICKLE_BYTES: usize = 1 << 26;
+/// Most bytes of an entry that is one word.
+const MAX_WORD: usize = 16;
 /// The pickled number that begins a stream, as the bytes of a long integer.
 const MAGIC: [u8; 10] = *b"l\xfc\x9cF\xf9 j\xa8P\x19";
 /// The version of the stream, the only one there has been.
@@ -98,10 +100,8 @@ fn read_archive(bytes: &[u8], entries: &[zip::Entry]) -> Result<Tensors, FieldEr
         let detail = "an archive of TorchScript: save the state_dict of the network instead".to_owned();
         return Err(FieldError::Unsupported { detail });
     }
-    if let Some(order) = inside.get("byteorder")
-        && order.size <= 16
-    {
-        let order = order.unpack(bytes)?;
+    if let Some(order) = inside.get("byteorder") {
+        let order = if order.size <= MAX_WORD { order.unpack(bytes)? } else { b"of another length".to_vec() };
         if order != b"little" {
             let detail = format!("the byte order {:?} of the checkpoint", String::from_utf8_lossy(&order));
             return Err(FieldError::Unsupported { detail });

@@ -6,6 +6,7 @@
 use super::pickle::{Container, Loaded, Value};
 use super::{FORMAT, MAX_TENSORS};
 use crate::field::FieldError;
+use std::borrow::Cow;
 use std::collections::{BTreeMap, HashSet};
 
 /// Most containers in containers, which is more than any training script nests and little for the stack of a thread.
@@ -29,6 +30,13 @@ struct Walk<'l, 'a> {
     name: String,
     seen: u64,
     found: BTreeMap<String, usize>,
+}
+
+/// What a member is called in its container.
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+enum Key<'a> {
+    Text(&'a str),
+    Number(i64),
 }
 
 fn fault(detail: String) -> FieldError {
@@ -70,18 +78,24 @@ impl Walk<'_, '_> {
         match &loaded.containers[index] {
             Container::List(members) | Container::Tuple(members) => {
                 for (i, member) in members.iter().enumerate() {
-                    self.member(*member, |_| i.to_string())?;
+                    self.member(*member, Key::Number(i as i64))?;
                 }
             }
             Container::Dictionary(pairs) => {
                 // of pairs with the same key the last one counts
-                let (mut texts, mut numbers) = (HashSet::new(), HashSet::new());
+                let mut seen = HashSet::new();
                 for (key, value) in pairs.iter().rev() {
-                    match *key {
-                        Value::Text(text) if texts.insert(text) => self.member(*value, |_| text.to_owned())?,
-                        Value::Int(number) if numbers.insert(number) => self.member(*value, |_| number.to_string())?,
+                    let key = match *key {
+                        // never hashed: one long text may be the key of many pairs
+                        Value::Text(text) if text.len() > MAX_NAME => Some(Key::Text(text)),
+                        Value::Text(text) => Some(Key::Text(text)).filter(|key| seen.insert(*key)),
+                        Value::Int(number) => Some(Key::Number(number)).filter(|key| seen.insert(*key)),
                         // keys of other types name nothing
-                        _ => self.member(Value::None, |_| String::new())?,
+                        _ => None,
+                    };
+                    match key {
+                        Some(key) => self.member(*value, key)?,
+                        None => self.look()?,
                     }
                 }
             }
@@ -89,16 +103,25 @@ impl Walk<'_, '_> {
         Ok(())
     }
 
-    fn member(&mut self, value: Value<'_>, key: impl Fn(()) -> String) -> Result<(), FieldError> {
+    /// Counts a value that is looked at.
+    fn look(&mut self) -> Result<(), FieldError> {
         self.seen += 1;
         if self.seen > MAX_VALUES {
             return Err(FieldError::Limit { what: "values of a checkpoint", found: self.seen, limit: MAX_VALUES });
         }
+        Ok(())
+    }
+
+    fn member(&mut self, value: Value<'_>, key: Key<'_>) -> Result<(), FieldError> {
+        self.look()?;
         if !matches!(value, Value::Tensor(_) | Value::Container(_)) {
             return Ok(());
         }
         let parent = self.name.len();
-        let key = key(());
+        let key = match key {
+            Key::Text(text) => Cow::Borrowed(text),
+            Key::Number(number) => Cow::Owned(number.to_string()),
+        };
         let length = parent + 1 + key.len();
         if length > MAX_NAME {
             let (found, limit) = (length as u64, MAX_NAME as u64);

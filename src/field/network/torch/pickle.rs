@@ -22,6 +22,8 @@ const MAX_STACK: usize = 1 << 18;
 const MAX_MARKS: usize = 1000;
 /// Most bytes of the name of a module or of a global.
 const MAX_GLOBAL: usize = 256;
+/// Most bytes of the key of a storage: a number, or an address in decimal.
+const MAX_KEY: usize = 256;
 /// Most bytes of a number written as text.
 const MAX_LINE: usize = 1 << 16;
 /// Most axes of a tensor, which is more than any layer has.
@@ -212,7 +214,13 @@ impl<'a> Machine<'a> {
     /// The values above the last mark, which goes with them.
     fn pop_mark(&mut self) -> Result<Vec<Value<'a>>, FieldError> {
         let mark = self.marks.pop().ok_or_else(|| self.fault("a mark is taken that is not there"))?;
-        Ok(self.stack.split_off(mark))
+        Ok(self.above(mark))
+    }
+
+    /// Takes the values from index `first` up, in a list no longer than they are: `split_off` would hand over the stack's own
+    /// allocation when it takes all, and a container for each of many opcodes would hold as much.
+    fn above(&mut self, first: usize) -> Vec<Value<'a>> {
+        self.stack.drain(first..).collect()
     }
 
     fn push_container(&mut self, container: Container<'a>) -> Result<(), FieldError> {
@@ -228,7 +236,7 @@ impl<'a> Machine<'a> {
     fn push_tuple(&mut self, count: usize) -> Result<(), FieldError> {
         let first = self.stack.len().checked_sub(count).filter(|&first| first >= self.floor());
         let first = first.ok_or_else(|| self.fault("a tuple is made of values that are not there"))?;
-        let members = self.stack.split_off(first);
+        let members = self.above(first);
         self.push_container(Container::Tuple(members))
     }
 

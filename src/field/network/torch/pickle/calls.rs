@@ -3,7 +3,7 @@
 use super::super::MAX_TENSORS;
 use super::super::globals::Global;
 use super::super::rebuild::{Record, Storage, View};
-use super::{Container, MAX_AXES, MAX_GLOBAL, Machine, Value, limit};
+use super::{Container, MAX_AXES, MAX_GLOBAL, MAX_KEY, Machine, Value, limit};
 use crate::field::FieldError;
 
 impl<'a> Machine<'a> {
@@ -181,6 +181,9 @@ impl<'a> Machine<'a> {
         else {
             return Err(self.fault("a persistent name is not that of a storage of numbers"));
         };
+        if key.len() > MAX_KEY {
+            return Err(limit("bytes of the key of a storage", key.len() as u64, MAX_KEY as u64));
+        }
         let count = self.size(count)?;
         let (offset, view_count) = match rest {
             [] | [Value::None, ..] => (0, count),

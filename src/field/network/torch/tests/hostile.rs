@@ -186,6 +186,38 @@ fn a_bomb_of_shared_containers_is_refused() {
 }
 
 #[test]
+fn a_container_holds_no_more_memory_than_its_members() {
+    // a stack that was once long, and then many tuples of one
+    let once_long = [&b"("[..], &b"N".repeat(200_000), b"1N", &b"\x85".repeat(50_000), b"("].concat();
+    let pickle = [&once_long[..], &b"N".repeat(10), b"l."].concat();
+    let loaded = pickle::load(&pickle, 0, "test").unwrap();
+    let reserved: usize = loaded
+        .containers
+        .iter()
+        .map(|container| match container {
+            pickle::Container::List(members) | pickle::Container::Tuple(members) => members.capacity(),
+            pickle::Container::Dictionary(pairs) => 2 * pairs.capacity(),
+        })
+        .sum();
+    assert!(reserved < 4 * 60_000, "{reserved}");
+}
+
+#[test]
+fn one_long_text_named_many_times_is_not_read_as_often() {
+    const LONG: u32 = 8 << 20;
+    let text = [&b"X"[..], &LONG.to_le_bytes(), &vec![b'x'; LONG as usize], b"q\x000"].concat();
+    // 50,000 readings would be 400 GB
+    let keys = [&text, &b"}("[..], &b"h\x00N".repeat(50_000), b"u."].concat();
+    let start = Instant::now();
+    assert!(read(&stream(&keys)).unwrap().is_empty());
+    let storage = b"(U\x07storagectorch\nFloatStorage\nh\x00U\x03cpuK\x01tQ0".repeat(20_000);
+    over_limit(&stream(&[&text, &storage[..], b"N."].concat()), "key of a storage");
+    let globals = b"h\x00h\x00\x93".repeat(20_000);
+    over_limit(&stream(&[&text, &globals[..], b"N."].concat()), "name of a global");
+    assert!(start.elapsed() < QUICK);
+}
+
+#[test]
 fn a_stack_that_runs_empty_is_refused() {
     for opcode in 0..=255u8 {
         for before in [&b""[..], b"(", b"N(", b"(N", b"]", b"N", b"NN", b"}N", b"NNN", b")N", b"c__builtin__\ndict\n"] {
