@@ -65,7 +65,7 @@ impl Record {
 
 /// Bytes of a storage, checked against the limit.
 pub(super) fn storage_bytes(storage: &Storage<'_>) -> Result<usize, FieldError> {
-    let size = storage.count.checked_mul(storage.kind.size()).unwrap_or(usize::MAX);
+    let size = storage.count.saturating_mul(storage.kind.size());
     if size > MAX_STORAGE_BYTES {
         let (found, limit) = (size as u64, MAX_STORAGE_BYTES as u64);
         return Err(FieldError::Limit { what: "bytes of a storage of a checkpoint", found, limit });
