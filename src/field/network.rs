@@ -15,6 +15,7 @@ pub mod niq;
 mod product;
 pub mod safetensors;
 pub mod tensors;
+pub mod torch;
 pub(in crate::field) mod zip;
 
 pub use activation::Activation;
