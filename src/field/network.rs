@@ -10,6 +10,8 @@
 
 mod activation;
 mod evaluate;
+pub mod family;
+pub mod folder;
 mod functions;
 pub mod niq;
 mod product;
