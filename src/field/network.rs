@@ -12,6 +12,7 @@ mod activation;
 mod evaluate;
 mod functions;
 pub mod niq;
+pub mod onnx;
 pub mod safetensors;
 pub mod tensors;
 pub(in crate::field) mod zip;

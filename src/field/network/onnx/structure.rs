@@ -1,0 +1,581 @@
+//! Operators that compute nothing: constants, and choosing, joining and reordering what is there.
+
+use super::forms::Forms;
+use super::operators::{Call, known, one};
+use super::shapes;
+use super::tensor::Tensor;
+use super::value::{Lead, Value, Varying, join_leads, with_own_rank};
+use crate::field::FieldError;
+use std::rc::Rc;
+
+/// An end of a slice that is meant to be the axis's: exporters write the largest number of 32 or of 64 bits.
+const OPEN_END: i64 = i32::MAX as i64;
+
+/// `Identity`, `Dropout` (which does nothing but in training), and casts. Half precision is worked out as single precision.
+pub(super) fn same(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
+    let integer = match call.node.operator {
+        "Cast" => match call.int("to", 0)? {
+            1 | 10 | 11 | 16 => Some(false),
+            6 | 7 | 9 => Some(true),
+            other => return Err(call.refused(&format!("to the type {other}"))),
+        },
+        "CastLike" => match call.argument(1)? {
+            Value::Constant(like) => Some(like.integer),
+            Value::Varying(_) => Some(false),
+            Value::Over(..) => return Err(call.refused("of truth values")),
+        },
+        _ => None,
+    };
+    let to_truth = call.node.operator == "Cast" && call.int("to", 0)? == 9;
+    match (call.argument(0)?, integer) {
+        (value, None) => one(value),
+        (Value::Constant(constant), Some(integer)) => {
+            if constant.integer == integer && !to_truth {
+                return one(Value::Constant(constant));
+            }
+            call.budget.numbers(constant.len())?;
+            let cast = |&v: &f64| match (integer, to_truth) {
+                (true, true) => f64::from(u8::from(v != 0.0)),
+                (true, false) => v.trunc(),
+                _ => v,
+            };
+            let numbers: Vec<f64> = constant.numbers.iter().map(cast).collect();
+            if !integer && numbers.iter().any(|v| v.is_nan()) {
+                return Err(call.refused("computing with the number of points"));
+            }
+            known(Tensor { shape: constant.shape.clone(), integer, numbers })
+        }
+        (value @ Value::Varying(_), Some(false)) => one(value),
+        _ => Err(call.refused("of a value that depends on the point")),
+    }
+}
+
+/// `Constant`, in whichever attribute the numbers are.
+pub(super) fn constant(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
+    for name in ["value", "value_float", "value_floats", "value_int", "value_ints"] {
+        if let Some(tensor) = call.held(name)? {
+            return known(tensor);
+        }
+    }
+    Err(call.refused("without numbers"))
+}
+
+/// A shape as an operator takes it: one axis of whole numbers that are not negative, or not known.
+fn lengths(call: &Call<'_, '_>, numbers: &[f64]) -> Result<Lead, FieldError> {
+    let length = |&v: &f64| match v {
+        v if v.is_nan() => Ok(None),
+        v if v >= 0.0 => Ok(Some(v as u64)),
+        v => Err(call.fault(&format!("an axis of length {v}"))),
+    };
+    numbers.iter().map(length).collect()
+}
+
+/// The axes after the last one whose length is not known.
+fn known_end(lengths: &[Option<u64>]) -> Vec<usize> {
+    let known: Vec<usize> =
+        lengths.iter().rev().map_while(|l| l.map(|l| usize::try_from(l).unwrap_or(usize::MAX))).collect();
+    known.into_iter().rev().collect()
+}
+
+pub(super) fn constant_of_shape(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
+    let mut lead = lengths(call, &call.tensor(0)?.numbers)?;
+    let shape = known_end(&lead);
+    lead.truncate(lead.len() - shape.len());
+    let (number, integer) = match call.held("value")? {
+        None => (0.0, false),
+        Some(held) if held.len() == 1 => (held.numbers[0], held.integer),
+        Some(_) => return Err(call.fault("more than one value")),
+    };
+    let size = shapes::count(&shape).unwrap_or(usize::MAX);
+    call.budget.numbers(size)?;
+    let tensor = Tensor { shape, integer, numbers: vec![number; size] };
+    if lead.is_empty() {
+        return known(tensor);
+    }
+    one(Value::Varying(Varying::repeated(&tensor, lead, call.budget)?))
+}
+
+pub(super) fn range(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
+    let number = |call: &Call<'_, '_>, at| match call.tensor(at)?.numbers.as_slice() {
+        [number] if !number.is_nan() => Ok(*number),
+        _ => Err(call.refused("a range as long as there are points")),
+    };
+    let (start, end, step) = (number(call, 0)?, number(call, 1)?, number(call, 2)?);
+    let count = ((end - start) / step).ceil().max(0.0);
+    if !count.is_finite() {
+        return Err(call.fault("a range without end"));
+    }
+    let count = count as usize;
+    call.budget.numbers(count)?;
+    let numbers = (0..count).map(|i| start + i as f64 * step).collect();
+    known(Tensor { shape: vec![count], integer: call.tensor(0)?.integer, numbers })
+}
+
+pub(super) fn shape(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
+    let lengths: Vec<f64> = match call.argument(0)? {
+        Value::Constant(constant) => constant.shape.iter().map(|&l| l as f64).collect(),
+        Value::Varying(varying) | Value::Over(varying, _) => {
+            let lead = varying.lead.iter().map(|l| l.map_or(f64::NAN, |l| l as f64));
+            lead.chain(varying.shape.iter().map(|&l| l as f64)).collect()
+        }
+    };
+    let kept = shapes::slice(call.int("start", 0)?, call.int("end", i64::MAX)?, 1, lengths.len());
+    let numbers: Vec<f64> = kept.unwrap_or_default().into_iter().map(|at| lengths[at]).collect();
+    known(Tensor::whole(vec![numbers.len()], numbers))
+}
+
+/// The axis that the attribute names, of so many.
+fn axis(call: &Call<'_, '_>, default: Option<i64>, rank: usize) -> Result<usize, FieldError> {
+    let number = call.int("axis", default.unwrap_or(i64::MIN))?;
+    shapes::axis(number, rank).ok_or_else(|| call.fault(&format!("axis {number} of {rank}")))
+}
+
+/// The same axis among those behind the leading ones.
+fn own_axis(call: &Call<'_, '_>, varying: &Varying, axis: usize) -> Result<usize, FieldError> {
+    axis.checked_sub(varying.lead.len()).ok_or_else(|| call.refused("of some of the points"))
+}
+
+/// Where the elements of joined tensors are if they first stand one tensor after the other.
+fn joined(call: &mut Call<'_, '_>, parts: &[Vec<usize>], axis: usize) -> Result<(Vec<usize>, Vec<usize>), FieldError> {
+    let mut shape = parts[0].clone();
+    let others =
+        |part: &[usize]| part.iter().enumerate().filter(|(i, _)| *i != axis).map(|(_, &l)| l).collect::<Vec<_>>();
+    if axis >= shape.len() || parts.iter().any(|part| part.len() != shape.len() || others(part) != others(&shape)) {
+        return Err(call.fault("pieces of shapes that do not fit"));
+    }
+    shape[axis] = parts.iter().map(|part| part[axis]).fold(0, usize::saturating_add);
+    call.budget.numbers(shapes::count(&shape).unwrap_or(usize::MAX))?;
+    let outer: usize = shape[..axis].iter().product();
+    let inner: usize = shape[axis + 1..].iter().product();
+    // an inner axis of length 0 and many pieces still are many steps
+    call.budget.work(outer.saturating_mul(parts.len()))?;
+    let mut places = Vec::new();
+    for o in 0..outer {
+        let mut start = 0;
+        for part in parts {
+            let row = part[axis] * inner;
+            places.extend(start + o * row..start + (o + 1) * row);
+            start += outer * row;
+        }
+    }
+    Ok((shape, places))
+}
+
+pub(super) fn concat(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
+    let values = (0..call.arguments.len()).map(|at| call.argument(at)).collect::<Result<Vec<_>, _>>()?;
+    let constants = values.iter().map(|v| if let Value::Constant(c) = v { Some(c.clone()) } else { None });
+    if let Some(constants) = constants.collect::<Option<Vec<_>>>() {
+        let Some(first) = constants.first() else {
+            return Err(call.fault("no pieces"));
+        };
+        let axis = axis(call, None, first.shape.len())?;
+        let parts: Vec<Vec<usize>> = constants.iter().map(|c| c.shape.clone()).collect();
+        let (shape, places) = joined(call, &parts, axis)?;
+        call.budget.numbers(2 * places.len())?;
+        let all: Vec<f64> = constants.iter().flat_map(|c| &c.numbers).copied().collect();
+        let numbers = places.into_iter().map(|p| all[p]).collect();
+        return known(Tensor { shape, integer: constants.iter().all(|c| c.integer), numbers });
+    }
+    // the constants among them take the axes of the one that varies and has the fewest of its own
+    let varying = values.iter().filter_map(|v| if let Value::Varying(v) = v { Some(v) } else { None });
+    let Some(model) = varying.min_by_key(|v| v.shape.len()).cloned() else {
+        return Err(call.refused("of truth values"));
+    };
+    let axis = axis(call, None, model.rank())?;
+    let axis = own_axis(call, &model, axis)?;
+    let (mut lead, mut pieces) = (model.lead.clone(), Vec::with_capacity(values.len()));
+    for value in &values {
+        let (own, forms) = match value {
+            Value::Varying(v) => (with_own_rank(&v.axes(), model.shape.len()), v.forms.clone()),
+            Value::Constant(c) => {
+                let last = c.last_axes(model.shape.len(), call.budget)?;
+                let last = last.filter(|l| l.numbers.iter().all(|n| n.is_finite()));
+                let last = last.ok_or_else(|| call.refused("a constant that is another one for every point"))?;
+                call.budget.numbers(2 * last.len())?;
+                (Some((Vec::new(), last.shape)), Rc::new(Forms::constant(last.numbers)))
+            }
+            Value::Over(..) => return Err(call.refused("of truth values")),
+        };
+        let own = own.and_then(|(l, shape)| Some((join_leads(&lead, &l)?, shape)));
+        let Some((joined_lead, shape)) = own else {
+            return Err(call.fault("pieces of shapes that do not fit"));
+        };
+        lead = joined_lead;
+        pieces.push((shape, forms));
+    }
+    let (parts, forms): (Vec<_>, Vec<_>) = pieces.into_iter().unzip();
+    let (shape, places) = joined(call, &parts, axis)?;
+    let forms = Forms::joined(&forms, call.stages, call.budget)?.take(&places, call.budget)?;
+    one(Value::Varying(Varying { lead, shape, forms: Rc::new(forms) }))
+}
+
+/// Some places of one axis, of a constant or of what depends on the point.
+fn kept(call: &mut Call<'_, '_>, value: &Value, axis: usize, kept: &[usize]) -> Result<Value, FieldError> {
+    let (shape, own) = match value {
+        Value::Constant(constant) => (&constant.shape, axis),
+        Value::Varying(varying) => (&varying.shape, own_axis(call, varying, axis)?),
+        Value::Over(..) => return Err(call.refused("of truth values")),
+    };
+    let mut result = shape.clone();
+    result[own] = kept.len();
+    let outer: usize = shape[..own].iter().product();
+    call.budget.numbers(shapes::count(&result).unwrap_or(usize::MAX))?;
+    call.budget.work(outer.saturating_mul(kept.len()))?;
+    let places = shapes::kept_indices(shape, own, kept);
+    Ok(match value {
+        Value::Constant(constant) => Value::Constant(Rc::new(constant.take(result, &places, call.budget)?)),
+        Value::Varying(varying) => Value::Varying(varying.take(result, &places, call.budget)?),
+        Value::Over(..) => return Err(call.refused("of truth values")),
+    })
+}
+
+/// Number of axes, those of the points included, and the length of each where it is known.
+fn axes(call: &Call<'_, '_>, value: &Value) -> Result<Lead, FieldError> {
+    match value {
+        Value::Constant(constant) => Ok(constant.shape.iter().map(|&l| Some(l as u64)).collect()),
+        Value::Varying(v) => Ok(v.lead.iter().copied().chain(v.shape.iter().map(|&l| Some(l as u64))).collect()),
+        Value::Over(..) => Err(call.refused("of truth values")),
+    }
+}
+
+pub(super) fn slice(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
+    let (starts, ends) = (call.list("starts", 1)?, call.list("ends", 2)?);
+    let (Some(starts), Some(ends)) = (starts, ends) else {
+        return Err(call.fault("no starts or no ends"));
+    };
+    let numbered = (0..starts.len() as i64).collect();
+    let (numbers, steps) = (call.list("axes", 3)?.unwrap_or(numbered), call.list("steps", 4)?);
+    let steps = steps.unwrap_or_else(|| vec![1; starts.len()]);
+    if [ends.len(), numbers.len(), steps.len()] != [starts.len(); 3] || starts.len() > super::model::MAX_AXES {
+        return Err(call.fault("starts, ends, axes and steps of different lengths"));
+    }
+    let mut value = call.argument(0)?;
+    for (((start, end), number), step) in starts.into_iter().zip(ends).zip(numbers).zip(steps) {
+        let lengths = axes(call, &value)?;
+        let axis = shapes::axis(number, lengths.len());
+        let axis = axis.ok_or_else(|| call.fault(&format!("axis {number} of {}", lengths.len())))?;
+        let leading = if let Value::Varying(v) = &value { v.lead.len() } else { 0 };
+        if axis < leading {
+            let all = start == 0
+                && step == 1
+                && (end >= OPEN_END || lengths[axis].is_some_and(|l| end >= 0 && end as u64 >= l));
+            if !all {
+                return Err(call.refused("of some of the points"));
+            }
+            continue;
+        }
+        let length = lengths[axis].unwrap_or(0) as usize;
+        let places = shapes::slice(start, end, step, length);
+        let places = places.ok_or_else(|| call.fault(&format!("a step of {step}")))?;
+        value = kept(call, &value, axis, &places)?;
+    }
+    one(value)
+}
+
+pub(super) fn gather(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
+    let (value, indices) = (call.argument(0)?, call.tensor(1)?);
+    let lengths = axes(call, &value)?;
+    let axis = axis(call, Some(0), lengths.len())?;
+    call.budget.numbers(indices.len())?;
+    let wanted = call.whole(&indices.numbers)?;
+    if let (Value::Varying(varying), true, true) = (&value, indices.shape.is_empty(), lengths[axis] == Some(1))
+        && axis < varying.lead.len()
+        && matches!(wanted[0], 0 | -1)
+    {
+        let mut lead = varying.lead.clone();
+        lead.remove(axis);
+        return one(Value::Varying(Varying { lead, ..varying.clone() }));
+    }
+    let length = lengths[axis].unwrap_or(0) as usize;
+    let places = wanted.iter().map(|&i| shapes::axis(i, length)).collect::<Option<Vec<usize>>>();
+    let leading = if let Value::Varying(v) = &value { v.lead.len() } else { 0 };
+    if axis < leading {
+        return Err(call.refused("of some of the points"));
+    }
+    let places = places.ok_or_else(|| call.fault(&format!("an index beyond an axis of {length}")))?;
+    let reshaped = |shape: &[usize], axis: usize| {
+        let mut shape = shape.to_vec();
+        shape.splice(axis..=axis, indices.shape.iter().copied());
+        shape
+    };
+    one(match kept(call, &value, axis, &places)? {
+        Value::Varying(v) => Value::Varying(Varying { shape: reshaped(&v.shape, axis - leading), ..v }),
+        Value::Constant(c) => {
+            let shape = reshaped(&c.shape, axis);
+            Value::Constant(Rc::new(Tensor { shape, ..Rc::unwrap_or_clone(c) }))
+        }
+        over => over,
+    })
+}
+
+pub(super) fn split(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
+    let value = call.argument(0)?;
+    let lengths = axes(call, &value)?;
+    let axis = axis(call, Some(0), lengths.len())?;
+    let length = lengths[axis].ok_or_else(|| call.refused("of some of the points"))?;
+    let parts = call.node.outputs.len() as u64;
+    let sizes = match call.list("split", 1)? {
+        Some(sizes) => sizes,
+        None => {
+            let size = length.div_ceil(parts.max(1));
+            (0..parts).map(|i| size.min(length.saturating_sub(i * size)) as i64).collect()
+        }
+    };
+    let mut left = length;
+    let mut results = Vec::with_capacity(sizes.len());
+    for size in sizes {
+        let start = length - left;
+        let rest = u64::try_from(size).ok().and_then(|size| left.checked_sub(size));
+        left = rest.ok_or_else(|| call.fault(&format!("pieces larger than an axis of {length}")))?;
+        let places: Vec<usize> = (start as usize..(length - left) as usize).collect();
+        results.push(kept(call, &value, axis, &places)?);
+    }
+    Ok(results)
+}
+
+pub(super) fn transpose(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
+    let value = call.argument(0)?;
+    let rank = axes(call, &value)?.len();
+    let order: Vec<usize> = match call.ints("perm")? {
+        None => (0..rank).rev().collect(),
+        Some(list) => list.iter().filter_map(|&axis| usize::try_from(axis).ok()).collect(),
+    };
+    let mut sorted = order.clone();
+    sorted.sort_unstable();
+    if !sorted.iter().copied().eq(0..rank) {
+        return Err(call.fault(&format!("an order that is none of {rank} axes")));
+    }
+    match value {
+        Value::Constant(constant) => {
+            call.budget.numbers(constant.len())?;
+            let shape = order.iter().map(|&axis| constant.shape[axis]).collect();
+            known(constant.take(shape, &shapes::permuted_indices(&constant.shape, &order), call.budget)?)
+        }
+        Value::Varying(varying) => {
+            let leading = varying.lead.len();
+            if order[..leading].iter().enumerate().any(|(i, &axis)| i != axis) {
+                return Err(call.refused("of points with columns"));
+            }
+            let order: Vec<usize> = order[leading..].iter().map(|axis| axis - leading).collect();
+            call.budget.numbers(varying.forms.len())?;
+            let shape = order.iter().map(|&axis| varying.shape[axis]).collect();
+            one(Value::Varying(varying.take(shape, &shapes::permuted_indices(&varying.shape, &order), call.budget)?))
+        }
+        Value::Over(..) => Err(call.refused("of truth values")),
+    }
+}
+
+pub(super) fn reshape(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
+    let (value, wanted) = (call.argument(0)?, call.tensor(1)?);
+    let old = axes(call, &value)?;
+    if wanted.len() > super::model::MAX_AXES {
+        return Err(call.fault(&format!("a shape of {} axes", wanted.len())));
+    }
+    let copies = call.int("allowzero", 0)? == 0;
+    let mut target = Vec::with_capacity(wanted.len());
+    for (i, &length) in wanted.numbers.iter().enumerate() {
+        target.push(match length {
+            0.0 if copies => {
+                let copied = old.get(i).ok_or_else(|| call.fault(&format!("a copy of axis {i} of {}", old.len())))?;
+                copied.map_or(f64::NAN, |l| l as f64)
+            }
+            length if length < -1.0 => return Err(call.fault(&format!("an axis of length {length}"))),
+            length => length,
+        });
+    }
+    match value {
+        Value::Constant(constant) => {
+            let shape = resolved(&target, constant.len());
+            let shape =
+                shape.ok_or_else(|| call.fault(&format!("a shape that does not hold {} numbers", constant.len())))?;
+            one(Value::Constant(Rc::new(Tensor { shape, ..Rc::unwrap_or_clone(constant) })))
+        }
+        Value::Varying(varying) => {
+            let resolved = columns_of(&target, &varying);
+            let (lead, shape) =
+                resolved.ok_or_else(|| call.refused("to a shape in which points and columns are mixed"))?;
+            one(Value::Varying(Varying { lead, shape, forms: varying.forms }))
+        }
+        Value::Over(..) => Err(call.refused("of truth values")),
+    }
+}
+
+/// A shape with at most one length of -1 for so many numbers.
+fn resolved(target: &[f64], count: usize) -> Option<Vec<usize>> {
+    let given = target
+        .iter()
+        .filter(|&&l| l != -1.0)
+        .try_fold(1usize, |p, &l| if l.is_nan() { None } else { p.checked_mul(l as usize) })?;
+    let missing = match target.iter().filter(|&&l| l == -1.0).count() {
+        0 => (given == count).then_some(1)?,
+        1 => count.checked_div(given).filter(|m| m * given == count)?,
+        _ => return None,
+    };
+    Some(target.iter().map(|&l| if l == -1.0 { missing } else { l as usize }).collect())
+}
+
+/// Which of the new axes are those of the points: at the end there must be axes that hold the columns of one point.
+fn columns_of(target: &[f64], varying: &Varying) -> Option<(Lead, Vec<usize>)> {
+    let size = varying.forms.len();
+    let (mut at, mut held) = (target.len(), 1usize);
+    while held != size && at > 0 && target[at - 1] >= 1.0 {
+        at -= 1;
+        held = held.checked_mul(target[at] as usize)?;
+    }
+    let mut shape: Vec<usize> = target[at..].iter().map(|&l| l as usize).collect();
+    let lead = if held == size {
+        // further axes of length 1 may belong to the columns, but for one that is left to the points
+        while at > 1 && target[at - 1] == 1.0 {
+            at -= 1;
+            shape.insert(0, 1);
+        }
+        &target[..at]
+    } else {
+        // -1 stands for what is left of the columns if all the points are counted before it
+        if at == 0 || target[at - 1] != -1.0 || !size.is_multiple_of(held.max(1)) {
+            return None;
+        }
+        let lead = &target[..at - 1];
+        let points = |lengths: &[Option<u64>]| {
+            let known: Option<u64> = lengths.iter().flatten().try_fold(1u64, |p, &l| p.checked_mul(l));
+            Some((known?, lengths.iter().filter(|l| l.is_none()).count()))
+        };
+        let new: Lead = lead.iter().map(|&l| if l.is_nan() { None } else { Some(l as u64) }).collect();
+        if points(&new)? != points(&varying.lead)? {
+            return None;
+        }
+        shape.insert(0, size / held.max(1));
+        lead
+    };
+    if lead.iter().filter(|&&l| l == -1.0).count() > 1 {
+        return None;
+    }
+    Some((lead.iter().map(|&l| if l >= 0.0 { Some(l as u64) } else { None }).collect(), shape))
+}
+
+pub(super) fn flatten(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
+    let value = call.argument(0)?;
+    let rank = axes(call, &value)?.len();
+    let number = call.int("axis", 1)?;
+    let axis = if number == rank as i64 { Some(rank) } else { shapes::axis(number, rank) };
+    let axis = axis.ok_or_else(|| call.fault(&format!("axis {number} of {rank}")))?;
+    match value {
+        Value::Constant(constant) => {
+            let shape = vec![constant.shape[..axis].iter().product(), constant.shape[axis..].iter().product()];
+            one(Value::Constant(Rc::new(Tensor { shape, ..Rc::unwrap_or_clone(constant) })))
+        }
+        Value::Varying(varying) if axis == varying.lead.len() => {
+            let all = varying.lead.iter().copied().try_fold(1u64, |p, l| p.checked_mul(l?));
+            let size = varying.forms.len();
+            one(Value::Varying(Varying { lead: vec![all], shape: vec![size], forms: varying.forms }))
+        }
+        _ => Err(call.refused("to a shape in which points and columns are mixed")),
+    }
+}
+
+pub(super) fn squeeze(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
+    let (value, listed) = (call.argument(0)?, call.list("axes", 1)?);
+    let lengths = axes(call, &value)?;
+    let mut gone: Vec<bool> = lengths.iter().map(|&l| listed.is_none() && l == Some(1)).collect();
+    for number in listed.into_iter().flatten() {
+        let axis = shapes::axis(number, lengths.len());
+        let axis = axis.ok_or_else(|| call.fault(&format!("axis {number} of {}", lengths.len())))?;
+        if lengths[axis] != Some(1) {
+            return Err(call.refused(&format!("of axis {axis}, which is not of length 1")));
+        }
+        gone[axis] = true;
+    }
+    let left =
+        |shape: &[usize], gone: &[bool]| shape.iter().zip(gone).filter(|(_, gone)| !**gone).map(|(&l, _)| l).collect();
+    match value {
+        Value::Constant(constant) => {
+            let shape = left(&constant.shape, &gone);
+            one(Value::Constant(Rc::new(Tensor { shape, ..Rc::unwrap_or_clone(constant) })))
+        }
+        Value::Varying(varying) => {
+            let (leading, own) = gone.split_at(varying.lead.len());
+            let lead = varying.lead.iter().zip(leading).filter(|(_, gone)| !**gone).map(|(&l, _)| l).collect();
+            one(Value::Varying(Varying { lead, shape: left(&varying.shape, own), forms: varying.forms }))
+        }
+        Value::Over(..) => Err(call.refused("of truth values")),
+    }
+}
+
+pub(super) fn unsqueeze(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
+    let value = call.argument(0)?;
+    let Some(listed) = call.list("axes", 1)? else {
+        return Err(call.fault("no axes"));
+    };
+    let rank = axes(call, &value)?.len() + listed.len();
+    if rank > super::model::MAX_AXES {
+        return Err(call.fault(&format!("a shape of {rank} axes")));
+    }
+    let mut new = vec![false; rank];
+    for number in listed {
+        let axis = shapes::axis(number, rank).filter(|&axis| !new[axis]);
+        new[axis.ok_or_else(|| call.fault(&format!("axis {number} of {rank}")))?] = true;
+    }
+    match value {
+        Value::Constant(constant) => {
+            let mut old = constant.shape.iter();
+            let shape = new.iter().map(|&new| if new { 1 } else { old.next().copied().unwrap_or(1) }).collect();
+            one(Value::Constant(Rc::new(Tensor { shape, ..Rc::unwrap_or_clone(constant) })))
+        }
+        Value::Varying(varying) => {
+            let (mut lead, mut shape) = (Lead::new(), Vec::new());
+            let (mut points, mut own) = (varying.lead.iter(), varying.shape.iter());
+            for new in new {
+                // an axis between those of the points is one of them, another stands with the columns
+                if !new {
+                    match points.next() {
+                        Some(&length) => lead.push(length),
+                        None => shape.push(own.next().copied().unwrap_or(1)),
+                    }
+                } else if points.len() > 0 {
+                    lead.push(Some(1));
+                } else {
+                    shape.push(1);
+                }
+            }
+            one(Value::Varying(Varying { lead, shape, forms: varying.forms }))
+        }
+        Value::Over(..) => Err(call.refused("of truth values")),
+    }
+}
+
+pub(super) fn expand(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
+    let target = lengths(call, &call.tensor(1)?.numbers)?;
+    let misfit = |call: &Call<'_, '_>| call.fault("a shape that the input cannot be repeated to");
+    let varying = match call.argument(0)? {
+        Value::Varying(varying) => varying,
+        Value::Over(..) => return Err(call.refused("of truth values")),
+        Value::Constant(constant) => {
+            let end = known_end(&target);
+            if end.len() == target.len() {
+                let shape = shapes::broadcast(&constant.shape, &end).ok_or_else(|| misfit(call))?;
+                call.budget.numbers(shapes::count(&shape).unwrap_or(usize::MAX))?;
+                let places = shapes::broadcast_indices(&constant.shape, &shape);
+                return known(constant.take(shape, &places, call.budget)?);
+            }
+            let last = constant.last_axes(end.len(), call.budget)?;
+            let last = last.ok_or_else(|| call.refused("a constant that is another one for every point"))?;
+            Varying::repeated(&last, Vec::new(), call.budget)?
+        }
+    };
+    // the columns are repeated to the last known axes of the target, the points to what is before
+    let mut axes = Some(varying.axes());
+    let mut own = varying.shape.len().min(target.len());
+    while own > 0 && target[target.len() - own..].iter().any(Option::is_none) {
+        own -= 1;
+        axes = axes.and_then(|axes| with_own_rank(&axes, own));
+    }
+    let (lead, shape) = axes.ok_or_else(|| misfit(call))?;
+    let (points, columns) = target.split_at(target.len() - own);
+    let columns = shapes::broadcast(&shape, &known_end(columns)).ok_or_else(|| misfit(call))?;
+    // a length that is not known is the number of points: what has no point of its own is repeated for each
+    let lead = join_leads(&lead, points).ok_or_else(|| misfit(call))?;
+    call.budget.numbers(shapes::count(&columns).unwrap_or(usize::MAX))?;
+    let places = shapes::broadcast_indices(&shape, &columns);
+    let forms = varying.forms.take(&places, call.budget)?;
+    one(Value::Varying(Varying { lead, shape: columns, forms: Rc::new(forms) }))
+}
