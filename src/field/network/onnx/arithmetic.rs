@@ -197,6 +197,9 @@ pub(super) fn unary(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
 }
 
 fn mapped(call: &mut Call<'_, '_>, constant: &Tensor, f: impl Fn(f64) -> f64) -> Result<Vec<Value>, FieldError> {
+    if constant.numbers.iter().any(|v| v.is_nan()) {
+        return Err(call.refused("computing with the number of points"));
+    }
     call.budget.numbers(constant.len())?;
     let numbers = constant.numbers.iter().map(|&x| f(x)).collect();
     known(checked(call, Tensor { shape: constant.shape.clone(), integer: constant.integer, numbers })?)

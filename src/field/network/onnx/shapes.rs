@@ -1,7 +1,10 @@
 //! Index arithmetic of row-major tensors: which element of the input every element of the output is.
 
-/// Number of elements, or `None` where it is too large to be counted.
+/// Number of elements, or `None` where it is too large to be counted. Other axes of something empty may have any length.
 pub(super) fn count(shape: &[usize]) -> Option<usize> {
+    if shape.contains(&0) {
+        return Some(0);
+    }
     shape.iter().try_fold(1usize, |product, &length| product.checked_mul(length))
 }
 
@@ -29,15 +32,19 @@ pub(super) fn broadcast(a: &[usize], b: &[usize]) -> Option<Vec<usize>> {
 
 /// Distance in memory of neighbours along every axis.
 fn strides(shape: &[usize]) -> Vec<usize> {
-    let mut strides = vec![1; shape.len()];
+    let mut strides = vec![1usize; shape.len()];
     for i in (1..shape.len()).rev() {
-        strides[i - 1] = strides[i] * shape[i];
+        // what is not empty was counted; of what is empty no element is asked for
+        strides[i - 1] = strides[i].wrapping_mul(shape[i]);
     }
     strides
 }
 
 /// Walks a shape in order; every element's place is the sum of its coordinates times `strides`.
 fn walk(shape: &[usize], strides: &[usize]) -> Vec<usize> {
+    if shape.contains(&0) {
+        return Vec::new();
+    }
     let mut indices = vec![0];
     for (&length, &stride) in shape.iter().zip(strides) {
         indices = indices.iter().flat_map(|&base| (0..length).map(move |i| base + i * stride)).collect();
@@ -64,6 +71,9 @@ pub(super) fn permuted_indices(shape: &[usize], order: &[usize]) -> Vec<usize> {
 
 /// The elements of a tensor of which only `kept` of an axis are taken, in that order.
 pub(super) fn kept_indices(shape: &[usize], axis: usize, kept: &[usize]) -> Vec<usize> {
+    if shape.contains(&0) || kept.is_empty() {
+        return Vec::new();
+    }
     let inner: usize = shape[axis + 1..].iter().product();
     let outer: usize = shape[..axis].iter().product();
     let mut indices = Vec::with_capacity(outer * kept.len() * inner);
@@ -78,6 +88,9 @@ pub(super) fn kept_indices(shape: &[usize], axis: usize, kept: &[usize]) -> Vec<
 
 /// Start, end and step of a slice, as ONNX clamps them to an axis of `length`: the places that are taken.
 pub(super) fn slice(start: i64, end: i64, step: i64, length: usize) -> Option<Vec<usize>> {
+    if length == 0 {
+        return (step != 0).then(Vec::new);
+    }
     let n = length as i64;
     let from_end = |v: i64| if v < 0 { v.saturating_add(n) } else { v };
     let (start, end) = (from_end(start), from_end(end));
@@ -104,6 +117,9 @@ mod tests {
         assert_eq!(broadcast_indices(&[3], &[2, 3]), [0, 1, 2, 0, 1, 2]);
         assert_eq!(permuted_indices(&[2, 3], &[1, 0]), [0, 3, 1, 4, 2, 5]);
         assert_eq!(kept_indices(&[2, 3, 2], 1, &[2, 0]), [4, 5, 0, 1, 10, 11, 6, 7]);
+        let empty = [usize::MAX, usize::MAX, 0, usize::MAX];
+        assert_eq!((count(&empty), permuted_indices(&empty, &[3, 2, 1, 0])), (Some(0), vec![]));
+        assert_eq!((broadcast_indices(&[1], &empty), kept_indices(&empty, 0, &[7])), (vec![], vec![]));
         assert_eq!(axis(-1, 2), Some(1));
         assert_eq!(axis(i64::MIN, 2), None);
     }

@@ -145,9 +145,11 @@ fn joined(call: &mut Call<'_, '_>, parts: &[Vec<usize>], axis: usize) -> Result<
     }
     shape[axis] = parts.iter().map(|part| part[axis]).fold(0, usize::saturating_add);
     call.budget.numbers(shapes::count(&shape).unwrap_or(usize::MAX))?;
+    if shape.contains(&0) {
+        return Ok((shape, Vec::new()));
+    }
     let outer: usize = shape[..axis].iter().product();
     let inner: usize = shape[axis + 1..].iter().product();
-    // an inner axis of length 0 and many pieces still are many steps
     call.budget.work(outer.saturating_mul(parts.len()))?;
     let mut places = Vec::new();
     for o in 0..outer {
@@ -218,9 +220,7 @@ fn kept(call: &mut Call<'_, '_>, value: &Value, axis: usize, kept: &[usize]) -> 
     };
     let mut result = shape.clone();
     result[own] = kept.len();
-    let outer: usize = shape[..own].iter().product();
     call.budget.numbers(shapes::count(&result).unwrap_or(usize::MAX))?;
-    call.budget.work(outer.saturating_mul(kept.len()))?;
     let places = shapes::kept_indices(shape, own, kept);
     Ok(match value {
         Value::Constant(constant) => Value::Constant(Rc::new(constant.take(result, &places, call.budget)?)),
@@ -265,6 +265,7 @@ pub(super) fn slice(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
             continue;
         }
         let length = lengths[axis].unwrap_or(0) as usize;
+        call.budget.numbers(length)?;
         let places = shapes::slice(start, end, step, length);
         let places = places.ok_or_else(|| call.fault(&format!("a step of {step}")))?;
         value = kept(call, &value, axis, &places)?;
@@ -313,6 +314,10 @@ pub(super) fn split(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
     let lengths = axes(call, &value)?;
     let axis = axis(call, Some(0), lengths.len())?;
     let length = lengths[axis].ok_or_else(|| call.refused("of some of the points"))?;
+    if let Value::Varying(varying) = &value {
+        own_axis(call, varying, axis)?;
+    }
+    call.budget.numbers(usize::try_from(length).unwrap_or(usize::MAX))?;
     let parts = call.node.outputs.len() as u64;
     let sizes = match call.list("split", 1)? {
         Some(sizes) => sizes,
@@ -461,7 +466,8 @@ pub(super) fn flatten(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError>
     let axis = axis.ok_or_else(|| call.fault(&format!("axis {number} of {rank}")))?;
     match value {
         Value::Constant(constant) => {
-            let shape = vec![constant.shape[..axis].iter().product(), constant.shape[axis..].iter().product()];
+            let product = |part: &[usize]| shapes::count(part).ok_or_else(|| call.fault("axes too long to be joined"));
+            let shape = vec![product(&constant.shape[..axis])?, product(&constant.shape[axis..])?];
             one(Value::Constant(Rc::new(Tensor { shape, ..Rc::unwrap_or_clone(constant) })))
         }
         Value::Varying(varying) if axis == varying.lead.len() => {
@@ -557,7 +563,7 @@ pub(super) fn expand(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> 
                 let places = shapes::broadcast_indices(&constant.shape, &shape);
                 return known(constant.take(shape, &places, call.budget)?);
             }
-            let last = constant.last_axes(end.len(), call.budget)?;
+            let last = constant.last_axes(end.len(), call.budget)?.filter(|l| l.numbers.iter().all(|v| v.is_finite()));
             let last = last.ok_or_else(|| call.refused("a constant that is another one for every point"))?;
             Varying::repeated(&last, Vec::new(), call.budget)?
         }

@@ -40,7 +40,8 @@ fn opened(name: &str) -> Network {
 }
 
 /// The error relative to what PyTorch's autograd gives in double precision: of a value to its magnitude, but not to less than
-/// 1e-3 of the largest of the 50; of a gradient to its length.
+/// a hundredth of the largest of the 50 (single precision rounds the sums that a value near zero is the difference of); of a
+/// gradient to its length.
 #[test]
 fn values_and_gradients_are_those_of_the_framework() {
     for name in FIXTURES {
@@ -61,7 +62,7 @@ fn values_and_gradients_are_those_of_the_framework() {
         let largest = values.iter().fold(0.0, |m: f64, v| m.max(v.abs()));
         let (mut worst_value, mut worst_gradient) = (0.0f64, 0.0f64);
         for (i, value) in values.iter().enumerate() {
-            let error = (f64::from(found[i]) - value).abs() / value.abs().max(1e-3 * largest);
+            let error = (f64::from(found[i]) - value).abs() / value.abs().max(1e-2 * largest);
             worst_value = worst_value.max(error);
             let length = gradients[i].iter().map(|g| g * g).sum::<f64>().sqrt();
             let off = (0..3).map(|a| (f64::from(slopes[a][i]) - gradients[i][a]).powi(2)).sum::<f64>().sqrt();
@@ -252,7 +253,7 @@ fn what_is_not_read_is_refused_by_its_name() {
     for (part, expected) in cases {
         let error = refusal(&after_a_layer(&[part, last()]));
         assert!(error.contains(expected), "{error:?} instead of {expected:?}");
-        assert!(error.starts_with("unsupported: the ONNX node"), "{error}");
+        assert!(error.starts_with("unsupported: the "), "{error}");
     }
     let elsewhere = [bytes(1, b"x"), bytes(2, b"y"), bytes(4, b"Gelu"), bytes(7, b"com.microsoft")].concat();
     let elsewhere = graph(&[bytes(1, &elsewhere), node("Relu", &["y"], "sdf", &[])]);
@@ -298,6 +299,14 @@ fn broken_graphs_are_refused_with_the_node_or_the_byte() {
         (graph(&[tensor("w", &[-3, 1], &numbers(3)), dense("sdf")]), "an axis of length -3"),
         (graph(&[tensor("w", &[1 << 60, 1 << 60], &numbers(3)), dense("sdf")]), "over the limit"),
         (graph(&[tensor("w", &[0, 1], &[]), dense("sdf")]), "a matrix of 0 rows"),
+        (
+            graph(&[
+                tensor("w", &[1 << 60, 1 << 60, 0], &[]),
+                node("Transpose", &["w"], "t", &[]),
+                node("MatMul", &["xyz", "t"], "sdf", &[]),
+            ]),
+            "MatMul",
+        ),
         (graph(&[w(), w(), dense("sdf")]), "the name \"w\" is given twice"),
         (graph(&[w(), dense("sdf"), dense("sdf")]), "the name \"sdf\" is given twice"),
         (graph(&[dense("sdf")]), "takes \"w\", which nothing before it gives (at byte"),
@@ -338,7 +347,7 @@ fn broken_graphs_are_refused_with_the_node_or_the_byte() {
     }
     // lengths within lengths: each nested message says that it is longer than the one around it
     let mut nested = vec![0x0a; 60];
-    nested.iter_mut().skip(1).step_by(2).for_each(|length| *length = 200);
+    nested.iter_mut().skip(1).step_by(2).for_each(|length| *length = 100);
     assert!(refusal(&graph(&[bytes(1, &nested)])).contains("where 58 are left"));
 }
 

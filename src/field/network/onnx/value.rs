@@ -78,16 +78,16 @@ impl Tensor {
     /// The last `rank` axes, where all that comes before is of length 1 or a repetition: a constant beside something that
     /// has that many axes of its own. `None` where it differs from point to point.
     pub(super) fn last_axes(&self, rank: usize, budget: &mut Budget) -> Result<Option<Self>, FieldError> {
-        let Some(extra) = self.shape.len().checked_sub(rank) else {
-            return Ok(Some(self.clone()));
-        };
-        let shape = self.shape[extra..].to_vec();
-        let size: usize = shape.iter().product();
         budget.numbers(self.len())?;
-        let Some(first) = self.numbers.get(..size) else {
+        let extra = self.shape.len().saturating_sub(rank);
+        if extra == 0 {
+            return Ok(Some(self.clone()));
+        }
+        let shape = self.shape[extra..].to_vec();
+        let Some(first) = shapes::count(&shape).and_then(|size| self.numbers.get(..size)) else {
             return Ok(None);
         };
-        if size == 0 || self.numbers.chunks_exact(size).any(|row| row != first) {
+        if first.is_empty() || self.numbers.chunks_exact(first.len()).any(|row| row != first) {
             return Ok(None);
         }
         Ok(Some(Self { shape, integer: self.integer, numbers: first.to_vec() }))
