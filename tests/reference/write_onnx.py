@@ -79,8 +79,10 @@ class Joined(nn.Module):
         self.decoder, self.one_row = decoder, one_row
 
     def forward(self, latent, xyz):
-        if self.one_row:
+        if self.one_row == "expand":
             latent = latent.expand(xyz.shape[0], -1)
+        elif self.one_row == "repeat":
+            latent = latent.repeat(xyz.shape[0], 1)
         return self.decoder(torch.cat([latent, xyz], 1))
 
 
@@ -259,9 +261,10 @@ def main():
     write(folder, "siren", siren(), True)
     write(folder, "siren_torchscript", siren(), False)
     write(folder, "deepsdf", DeepSdf(), False, (8,))
-    write(folder, "deepsdf_two_inputs", Joined(DeepSdf(), False), True, (5, 3))
-    write(folder, "deepsdf_one_code", Joined(DeepSdf(), True), False, (5, 3), rows=1)
-    write(folder, "deepsdf_one_code_dynamo", Joined(DeepSdf(), True), True, (5, 3), rows=1)
+    write(folder, "deepsdf_two_inputs", Joined(DeepSdf(), None), True, (5, 3))
+    write(folder, "deepsdf_one_code", Joined(DeepSdf(), "expand"), False, (5, 3), rows=1)
+    write(folder, "deepsdf_one_code_dynamo", Joined(DeepSdf(), "expand"), True, (5, 3), rows=1)
+    write(folder, "deepsdf_repeated_code", Joined(DeepSdf(), "repeat"), True, (5, 3), rows=1)
     write(folder, "deepsdf_weight_norm", DeepSdf(norm=True), False, (8,), do_constant_folding=False)
     write(folder, "idr", Idr(), True)
     write(folder, "idr_unfolded", Idr(), False, do_constant_folding=False)

@@ -15,6 +15,7 @@
 //! counted against a [`Budget`](budget::Budget) of so much for every byte.
 
 mod arithmetic;
+mod axes;
 mod budget;
 mod forms;
 mod graph;

@@ -5,7 +5,7 @@ use super::model::{Attribute, Node, is_standard};
 use super::stages::Stages;
 use super::tensor::Tensor;
 use super::value::Value;
-use super::{arithmetic, fault, structure};
+use super::{arithmetic, axes, fault, structure};
 use crate::field::FieldError;
 use std::rc::Rc;
 
@@ -43,12 +43,13 @@ pub(super) fn apply(call: &mut Call<'_, '_>) -> Result<Vec<Value>, FieldError> {
         "Slice" => structure::slice(call),
         "Gather" => structure::gather(call),
         "Split" => structure::split(call),
-        "Transpose" => structure::transpose(call),
-        "Reshape" => structure::reshape(call),
-        "Flatten" => structure::flatten(call),
-        "Squeeze" => structure::squeeze(call),
-        "Unsqueeze" => structure::unsqueeze(call),
-        "Expand" => structure::expand(call),
+        "Transpose" => axes::transpose(call),
+        "Reshape" => axes::reshape(call),
+        "Flatten" => axes::flatten(call),
+        "Squeeze" => axes::squeeze(call),
+        "Unsqueeze" => axes::unsqueeze(call),
+        "Expand" => axes::expand(call),
+        "Tile" => axes::tile(call),
         _ => Err(call.refused("")),
     }
 }

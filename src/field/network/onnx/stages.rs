@@ -21,6 +21,9 @@ const SAME_FREQUENCY: f64 = 1e-6;
 /// How far a phase may be from that of the cosine: roundings of double precision, for a cosine is read as a shifted sine.
 const SAME_PHASE: f64 = 1e-12;
 
+/// For every stage that is part of the encoding the columns of the input that its units are, with their signs.
+type Places = Vec<Option<Vec<(usize, f64)>>>;
+
 /// An activation over forms.
 #[derive(Debug)]
 pub(super) struct Stage {
@@ -133,13 +136,7 @@ impl Stages {
 
     /// The encoding that the needed sines of coordinates make up, and for every stage that is part of it the columns of the
     /// input that its units are, with their signs. Either all such sines fit one encoding, or none is taken.
-    fn encoding(
-        &self,
-        parents: &[Vec<usize>],
-        needed: &[bool],
-        last: usize,
-        latent_size: usize,
-    ) -> (Encoding, Vec<Option<Vec<(usize, f64)>>>) {
+    fn encoding(&self, parents: &[Vec<usize>], needed: &[bool], last: usize, latent_size: usize) -> (Encoding, Places) {
         let waves: Vec<Option<Vec<Wave>>> =
             (0..self.list.len())
                 .map(|i| {
@@ -186,7 +183,7 @@ impl Stages {
             }
             let below = |&parent: &usize| if parent == 0 { 0 } else { depths[parent - 1] };
             let depth = parents[i].iter().map(below).max().unwrap_or(0) + 1;
-            for parent in parents[i].iter().filter(|p| (1..depth - 1).contains(&below(p))) {
+            if let Some(parent) = parents[i].iter().find(|p| (1..depth - 1).contains(&below(p))) {
                 let detail = format!(
                     "{} takes what {} gives past a layer in between (residual connections are not read)",
                     self.list[i].title,
@@ -261,8 +258,7 @@ struct Plan<'a> {
     stages: &'a Stages,
     parents: Vec<Vec<usize>>,
     depths: Vec<usize>,
-    /// The columns of the input that the units of a stage of the encoding are.
-    places: Vec<Option<Vec<(usize, f64)>>>,
+    places: Places,
     /// Number of inputs, the encoding included.
     input: usize,
 }

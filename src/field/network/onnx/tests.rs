@@ -5,13 +5,14 @@ use crate::field::{Field, Gradients, Points};
 use std::path::PathBuf;
 
 /// Written by `tests/reference/write_onnx.py`: by PyTorch's two exporters with and without their simplifications, and by hand.
-const FIXTURES: [&str; 16] = [
+const FIXTURES: [&str; 17] = [
     "siren",
     "siren_torchscript",
     "deepsdf",
     "deepsdf_two_inputs",
     "deepsdf_one_code",
     "deepsdf_one_code_dynamo",
+    "deepsdf_repeated_code",
     "deepsdf_weight_norm",
     "idr",
     "idr_unfolded",
