@@ -14,6 +14,7 @@ pub mod family;
 pub mod folder;
 mod functions;
 pub mod niq;
+pub mod onnx;
 mod product;
 pub mod safetensors;
 pub mod tensors;

@@ -172,7 +172,9 @@ fn detect(tensors: &Tensors, stack: &Stack, specs: Option<&Specs>) -> Detected {
             of(Family::SirenNerf, format!("its layers are named like {shown:?}, and the first takes {inputs} numbers"))
         }
         Scheme::Net => of(Family::Siren, format!("its layers are named like {shown:?}")),
-        Scheme::Layers => of(Family::SirenLucidrains, format!("its layers are named like {shown:?}, with a last_layer")),
+        Scheme::Layers => {
+            of(Family::SirenLucidrains, format!("its layers are named like {shown:?}, with a last_layer"))
+        }
         Scheme::Lin if stack.prefix.contains("sdf_network") => {
             of(Family::Neus, format!("its layers are named like {shown:?}"))
         }
@@ -225,9 +227,7 @@ fn input_of(
         (None, Some(frequencies)) if family == Family::SirenNerf && frequencies <= MAX_FREQUENCIES => {
             Encoding::Positional { frequencies, base: std::f32::consts::PI }
         }
-        (None, Some(frequencies))
-            if is_softplus(family) && family != Family::Igr && frequencies <= MAX_FREQUENCIES =>
-        {
+        (None, Some(frequencies)) if is_softplus(family) && family != Family::Igr && frequencies <= MAX_FREQUENCIES => {
             assumed.push(format!("a point is encoded by {frequencies} octaves from 1 on (`encoding`)"));
             Encoding::Positional { frequencies, base: 1.0 }
         }
@@ -238,7 +238,9 @@ fn input_of(
         return Err(fault(format!("the first layer takes {inputs} numbers, and a point alone is {size} of them")));
     };
     if let Some(length) = specs.and_then(|s| s.code_length).filter(|&length| length != latent) {
-        return Err(fault(format!("specs.json has a CodeLength of {length}, and the first layer has room for {latent}")));
+        return Err(fault(format!(
+            "specs.json has a CodeLength of {length}, and the first layer has room for {latent}"
+        )));
     }
     if latent > 0 && matches!(family, Family::Siren | Family::SirenNerf | Family::SirenLucidrains) {
         let detail = format!("the first layer takes {inputs} numbers, which is no point and no encoding of it");

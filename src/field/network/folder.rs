@@ -31,7 +31,8 @@ pub(in crate::field) fn claims(entries: &[zip::Entry]) -> bool {
 
 /// The checkpoint in a folder of the archive: `latest.pth`, or else the one with the largest number or the last name.
 fn checkpoint<'a>(entries: &'a [zip::Entry], folder: &str) -> Option<&'a zip::Entry> {
-    let in_folder = |e: &&zip::Entry| e.name.strip_prefix(folder).is_some_and(|n| n.ends_with(".pth") && !n.contains('/'));
+    let in_folder =
+        |e: &&zip::Entry| e.name.strip_prefix(folder).is_some_and(|n| n.ends_with(".pth") && !n.contains('/'));
     let rank = |e: &&zip::Entry| {
         let name = &e.name[folder.len()..];
         let number: Option<u64> = name.strip_suffix(".pth").and_then(|stem| stem.parse().ok());
@@ -72,8 +73,10 @@ pub fn pack(folder: &Path) -> std::io::Result<Vec<u8>> {
     let mut names = vec![SPECS.to_owned()];
     for part in ["ModelParameters", "LatentCodes"] {
         let Ok(list) = std::fs::read_dir(folder.join(part)) else { continue };
-        let mut found: Vec<String> =
-            list.filter_map(|entry| entry.ok()?.file_name().into_string().ok()).filter(|n| n.ends_with(".pth")).collect();
+        let mut found: Vec<String> = list
+            .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
+            .filter(|n| n.ends_with(".pth"))
+            .collect();
         found.sort();
         if found.iter().any(|name| name == LATEST) {
             found.retain(|name| name == LATEST);

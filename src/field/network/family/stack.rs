@@ -173,7 +173,8 @@ fn dense(parts: &Parts<'_>, left: &mut usize) -> Result<Dense, FieldError> {
     })?;
     let mut weights = matrix.values.clone();
     if let Some(direction) = parts.direction {
-        let length = parts.length.ok_or_else(|| fault(format!("{name:?} has a direction and no length of its weight")))?;
+        let length =
+            parts.length.ok_or_else(|| fault(format!("{name:?} has a direction and no length of its weight")))?;
         if length.values.len() != outputs {
             let found = length.values.len();
             return Err(fault(format!("{name:?} has {outputs} rows and {found} lengths of them")));
