@@ -17,7 +17,7 @@ const MOMENTS: u32 = 40;
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let pool = rayon::ThreadPoolBuilder::new().build()?;
     for path in std::env::args().skip(1) {
-        let field = open(&std::fs::read(&path)?, &FieldOptions::default())?;
+        let field = open(&std::fs::read(&path)?, &FieldOptions::default())?.field;
         let run = |cancel: &CancelToken| {
             let settings = Settings { pool: &pool, cancel, progress: &|_| {} };
             let tally = Tally::new();

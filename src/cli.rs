@@ -130,6 +130,21 @@ pub struct FieldArgs {
     /// Box that holds the field's zero level set (of a grid: that its samples span): fit, or X0,Y0,Z0,X1,Y1,Z1
     #[arg(long, value_name = "BOX", value_parser = parse_domain, allow_hyphen_values = true)]
     pub domain: Option<DomainOption>,
+    /// What the file does not say, as the members of a job's field: '{"w0": 25, "sign": "positive_inside"}'
+    #[arg(long, value_name = "JSON", value_parser = parse_field_options)]
+    pub field_options: Option<Box<FieldOptions>>,
+}
+
+/// The options in a JSON object.
+fn parse_field_options(text: &str) -> Result<Box<FieldOptions>, String> {
+    let options: FieldOptions = serde_json::from_str(text).map_err(|e| e.to_string())?;
+    options.check().map_err(|e| e.to_string())?;
+    Ok(Box::new(options))
+}
+
+/// The bytes of a field's file; a folder of DeepSDF as the archive that would be uploaded.
+fn read_field(path: &Path) -> std::io::Result<Vec<u8>> {
+    if path.is_dir() { crate::field::network::folder::pack(path) } else { std::fs::read(path) }
 }
 
 impl FieldArgs {
@@ -138,11 +153,13 @@ impl FieldArgs {
     /// # Errors
     /// An exit code and what to say, when that file is no list of finite numbers.
     fn read(&self) -> Result<FieldOptions, (u8, String)> {
+        let given = self.field_options.as_deref().cloned().unwrap_or_default();
+        let latent = self.latent.as_deref().map(read_latent).transpose()?;
         Ok(FieldOptions {
-            latent: self.latent.as_deref().map(read_latent).transpose()?,
-            latent_row: self.latent_row,
-            domain: self.domain,
-            ..FieldOptions::default()
+            latent: latent.or(given.latent),
+            latent_row: self.latent_row.or(given.latent_row),
+            domain: self.domain.or(given.domain),
+            ..given
         })
     }
 }

@@ -112,7 +112,7 @@ fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
 
 /// Reads a file and opens it; what is wrong is said with the file's name.
 fn open(path: &Path, with: impl FnOnce(&[u8]) -> Result<Opened, Box<Failure>>) -> Result<Opened, (u8, String)> {
-    let bytes = std::fs::read(path).map_err(|e| (BAD_INPUT, format!("{}: {e}", path.display())))?;
+    let bytes = super::read_field(path).map_err(|e| (BAD_INPUT, format!("{}: {e}", path.display())))?;
     with(&bytes).map_err(|failure| {
         let places: String = failure.errors.iter().map(|e| format!("\n  {}: {}", e.pointer, e.detail)).collect();
         (BAD_INPUT, format!("{}: {}{places}", path.display(), failure.detail))

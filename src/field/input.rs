@@ -1,22 +1,24 @@
 //! From bytes to a [`Field`]: the kind is told by the content, the options are applied or refused, one by one.
 //!
 //! [`describe`] reads a file as [`open`] does and says what it holds, so a bad file is refused when it arrives and not
-//! when a job begins. Formats that are recognised and not read yet are refused by their name.
+//! when a job begins.
 
+mod network;
 mod options;
 mod sniff;
 mod wrap;
 
-pub use options::{DomainName, DomainOption, FieldOptions, Rotation, Transform};
+pub use options::{DomainName, DomainOption, FieldOptions, Frequency, Rotation, Sign, Transform};
 pub use sniff::Format;
 
 use super::grid::Grid;
 use super::mesh::{MeshField, Soundness, TriangleMesh};
-use super::network::{Activation, Network, niq, safetensors};
+use super::network::family::Detected;
+use super::network::{Activation, Network};
 use super::scene::Scene;
 use super::{Domain, Field, FieldError, Metric};
 use options::refuse;
-use wrap::{Boxed, Leveled, Transformed};
+use wrap::{Boxed, Leveled, Scaled, Transformed};
 
 /// What a file holds.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
@@ -35,8 +37,11 @@ pub enum Description {
     },
     /// A neural field.
     Network {
-        /// `safetensors` or `npz`.
+        /// `safetensors`, `torch`, `deep_sdf_folder` (a zip archive of one), `onnx` or `npz`.
         format: String,
+        /// What it was taken for.
+        #[serde(flatten)]
+        detected: Detected,
         /// Outputs of every layer, in order.
         layers: Vec<u32>,
         /// Activation of the hidden layers, by name; `mixed` when they differ.
@@ -77,17 +82,32 @@ pub enum Description {
     },
 }
 
+/// A field, and what its file was taken for.
+pub struct Opened {
+    /// The field.
+    pub field: Box<dyn Field>,
+    /// What a network's file was taken for.
+    pub detected: Option<Detected>,
+}
+
+impl From<Box<dyn Field>> for Opened {
+    fn from(field: Box<dyn Field>) -> Self {
+        Self { field, detected: None }
+    }
+}
+
 /// Reads a field from the bytes of any known format, with `options` applied.
 ///
 /// # Errors
 /// [`FieldError::Invalid`] with a fault per option that does not fit (pointers from the root of the options), otherwise
 /// what the format's reader says.
-pub fn open(bytes: &[u8], options: &FieldOptions) -> Result<Box<dyn Field>, FieldError> {
+pub fn open(bytes: &[u8], options: &FieldOptions) -> Result<Opened, FieldError> {
     let format = Format::detect(bytes)?;
     let mut faults = options.faults();
     match format {
         Format::Scene => {
             faults.extend(options.refuse_network_members("a scene"));
+            faults.extend(options.refuse_value_members("a scene"));
             refuse(faults)?;
             // a fitted domain moves with the scene; one that is given holds for the scene as it was moved
             let fit = DomainOption::Named(DomainName::Fit);
@@ -97,26 +117,25 @@ pub fn open(bytes: &[u8], options: &FieldOptions) -> Result<Box<dyn Field>, Fiel
                 let detail = "a scene of dimension 2 can only be turned and moved in its plane";
                 refuse(vec![options::fault("/transform", "not_offered", detail)])?;
             }
-            Ok(finish(field, options, on_scene.is_some()))
+            Ok(finish(field, options, on_scene.is_some()).into())
         }
-        Format::Safetensors | Format::Npz => {
+        Format::Safetensors | Format::Npz | Format::Torch | Format::Folder | Format::Onnx => {
             refuse(std::mem::take(&mut faults))?;
-            let mut network = read_network(bytes, format)?;
+            let (mut network, detected) = network::read(bytes, format, options)?;
             let latent = options.latent_of(&network, &mut faults);
             if options.domain == Some(DomainOption::Named(DomainName::Fit)) {
                 faults.push(options::fault("/domain", "not_offered", "a network's domain cannot be fitted"));
             }
+            network::overridden(&mut network, options, &mut faults);
             refuse(faults)?;
-            if let (Some(activation), Some((_, hidden))) = (options.activation, network.layers.split_last_mut()) {
-                hidden.iter_mut().for_each(|layer| layer.activation = activation);
-            }
             let field = network
                 .field(&latent)
                 .ok_or_else(|| FieldError::Unsupported { detail: "a latent code that is not finite".to_owned() })?;
-            Ok(finish(Box::new(field), options, false))
+            Ok(Opened { field: finish(Box::new(field), options, false), detected: Some(detected) })
         }
         Format::Mesh(_) => {
             faults.extend(options.refuse_network_members("a mesh"));
+            faults.extend(options.refuse_value_members("a mesh"));
             refuse(faults)?;
             let mut mesh = TriangleMesh::read(bytes)?;
             if let Some(transform) = &options.transform {
@@ -124,7 +143,7 @@ pub fn open(bytes: &[u8], options: &FieldOptions) -> Result<Box<dyn Field>, Fiel
             }
             // the transform is in the vertices already, where it costs nothing
             let rest = FieldOptions { transform: None, ..options.clone() };
-            Ok(finish(Box::new(MeshField::new(mesh)?), &rest, false))
+            Ok(finish(Box::new(MeshField::new(mesh)?), &rest, false).into())
         }
         Format::Grid => {
             faults.extend(options.refuse_network_members("a grid"));
@@ -137,7 +156,7 @@ pub fn open(bytes: &[u8], options: &FieldOptions) -> Result<Box<dyn Field>, Fiel
                 }
             };
             refuse(faults)?;
-            Ok(finish(Box::new(Grid::read(bytes, domain)?), options, true))
+            Ok(finish(Box::new(Grid::read(bytes, domain)?), options, true).into())
         }
     }
 }
@@ -155,10 +174,11 @@ pub fn describe(bytes: &[u8]) -> Result<Description, FieldError> {
             let (dimension, metric, domain) = (scene.dimension(), scene.metric(), scene.domain());
             Description::Scene { format: name, dimension, metric, domain }
         }
-        Format::Safetensors | Format::Npz => {
-            let network = read_network(bytes, format)?;
+        Format::Safetensors | Format::Npz | Format::Torch | Format::Folder | Format::Onnx => {
+            let (network, detected) = network::read(bytes, format, &FieldOptions::default())?;
             Description::Network {
                 format: name,
+                detected,
                 layers: network.layers.iter().map(|l| l.outputs() as u32).collect(),
                 activation: hidden_activation(&network).to_owned(),
                 latent_size: network.latent_size as u32,
@@ -187,18 +207,19 @@ pub fn describe(bytes: &[u8]) -> Result<Description, FieldError> {
     })
 }
 
-fn read_network(bytes: &[u8], format: Format) -> Result<Network, FieldError> {
-    if format == Format::Npz { niq::read(bytes) } else { safetensors::read(bytes) }
-}
-
 fn hidden_activation(network: &Network) -> &'static str {
     let hidden = &network.layers[..network.layers.len().saturating_sub(1)];
     let first = hidden.first().map_or(Activation::Identity, |l| l.activation);
     if hidden.iter().all(|l| l.activation.name() == first.name()) { first.name() } else { "mixed" }
 }
 
-/// Puts transform, level and domain around a field. `placed` says that the domain option was used up on the way.
+/// Puts sign, scale, transform, level and domain around a field. `placed` says that the domain option was used up on the way.
 fn finish(mut field: Box<dyn Field>, options: &FieldOptions, placed: bool) -> Box<dyn Field> {
+    let sign = if options.sign == Some(Sign::PositiveInside) { -1.0 } else { 1.0 };
+    let factor = sign * options.scale.unwrap_or(1.0);
+    if factor != 1.0 {
+        field = Box::new(Scaled::new(field, factor));
+    }
     if let Some(transform) = &options.transform {
         field = Box::new(Transformed::new(field, transform));
     }

@@ -51,7 +51,7 @@ pub enum Encoding {
         /// Number of octaves, from 1 to 16.
         frequencies: u32,
         /// Angular frequency of the first octave: 1 in IDR and NeuS, pi in NeRF.
-        base: f32,
+        base: f64,
     },
 }
 

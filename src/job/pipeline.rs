@@ -9,6 +9,7 @@ use super::spec::{FieldSpec, OutputName};
 use crate::blobs::BlobId;
 use crate::extract::{Budget, Extracted, Part, extract};
 use crate::field::input::{self, Description};
+use crate::field::network::family::Detected;
 use crate::field::sampler::Tally;
 use crate::field::scene::Scene;
 use crate::field::{Field, FieldError, Sampler};
@@ -35,6 +36,8 @@ pub struct Opened {
     pub weight: Option<Box<dyn Field>>,
     /// The hash and the size of the field's bytes, and the options; written into the GLB.
     pub provenance: Value,
+    /// What a network's file was taken for.
+    pub detected: Option<Detected>,
 }
 
 /// What a job made.
@@ -138,10 +141,11 @@ pub fn open(spec: &FieldSpec, bytes: Option<&[u8]>, at: &str) -> Result<Opened, 
         }
     };
     let bytes = scene.as_deref().or(bytes).ok_or_else(|| Box::new(Failure::internal()))?;
-    let field = input::open(bytes, &spec.options).map_err(|e| Failure::from_field(&e, at))?;
+    let input::Opened { field, detected } =
+        input::open(bytes, &spec.options).map_err(|e| Failure::from_field(&e, at))?;
     // the bytes of a scene in a request are its JSON without spaces, members in alphabetical order
     let provenance = json!({"sha256": BlobId::of(bytes).hex(), "bytes": bytes.len(), "options": spec.options});
-    Ok(Opened { field, weight: None, provenance })
+    Ok(Opened { field, weight: None, provenance, detected })
 }
 
 impl Opened {
@@ -196,6 +200,7 @@ pub fn make(opened: &Opened, asked: &Asked<'_>, settings: Settings<'_>) -> Resul
     let made = extract(&sampler, asked.shrink, opened.weight.as_deref(), asked.budget, &|part| clock.begin(Some(part)));
     clock.begin(None);
     let Extracted { surface, mut report, refusal } = made?;
+    report.network = opened.detected.clone();
     report.seconds.load = asked.load_seconds;
     report.seconds.shrink = clock.shrink.get();
     report.seconds.finish = clock.measure.get();

@@ -103,7 +103,7 @@ pub struct FieldSpec {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>)]
     pub input: Option<BlobId>,
-    /// What to do with the field: latent code, transform, domain, level, activation.
+    /// What to do with the field, and what its file does not say.
     #[serde(flatten)]
     pub options: FieldOptions,
 }

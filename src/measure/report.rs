@@ -4,6 +4,7 @@ use super::certificate::{certify, uv_flips};
 use super::distance::{Comparison, to_truth};
 use super::distortion::distortions;
 use super::verdict::{Figures, Verdict, judge};
+use crate::field::network::family::Detected;
 use crate::field::sampler::Tally;
 use crate::field::{Counts, Sampler};
 use crate::settings::Canceled;
@@ -57,6 +58,9 @@ pub struct Report {
     /// against the field as it was mended: without other components, with plugs across handles and bridges.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub topology: Option<Topology>,
+    /// What a network's file was taken for, and what it does not say; filled in by the caller, who opened it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub network: Option<Detected>,
     /// Attempts that were made at the surface, each with more effort; `evaluations` and `seconds` are those of all.
     pub attempts: u32,
     /// Whether the result succeeds, and if not, why not and where.
@@ -102,6 +106,7 @@ pub fn measure(
         lattice: spec.lattice,
         options: spec.clone(),
         topology: None,
+        network: None,
         attempts: 1,
         verdict: judge(&certificate, &comparison, vertices),
         version: env!("CARGO_PKG_VERSION").to_owned(),

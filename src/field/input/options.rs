@@ -1,7 +1,8 @@
 //! What may be asked of a field beside its bytes, and whether that makes sense.
 
 use crate::field::mesh::TriangleMesh;
-use crate::field::network::{Activation, Network};
+use crate::field::network::family::Family;
+use crate::field::network::{Activation, Encoding, Network, Skip};
 use crate::field::{Domain, Fault, FieldError};
 use glam::{DMat3, DVec3};
 
@@ -33,6 +34,60 @@ pub struct FieldOptions {
     /// The activation of a network's hidden layers, in place of the file's.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub activation: Option<Activation>,
+    /// The family of a network's file, in place of the one that is detected.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub family: Option<Family>,
+    /// The frequency of a network's sines, which no file of a SIREN says: one for all, or that of the first layer and that
+    /// of the others.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub w0: Option<Frequency>,
+    /// How the input is joined to the layers that take it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub skip: Option<Skip>,
+    /// How a point becomes the network's input.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub encoding: Option<Encoding>,
+    /// On which side a network's or a grid's values are positive; outside by default.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sign: Option<Sign>,
+    /// What a network's or a grid's values are multiplied by to be lengths in its own units, before the transform.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub scale: Option<f32>,
+}
+
+/// Where values are positive.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Sign {
+    /// Outside the solid, as signed distances are here.
+    PositiveOutside,
+    /// Inside, as occupancies are.
+    PositiveInside,
+}
+
+/// Frequencies of a network's sines.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
+#[serde(untagged)]
+pub enum Frequency {
+    /// Of all layers.
+    All(f32),
+    /// Of the first layer, and of the others.
+    FirstAndOthers([f32; 2]),
+}
+
+impl Frequency {
+    /// That of the first layer.
+    pub fn first(self) -> f32 {
+        match self {
+            Self::All(w0) | Self::FirstAndOthers([w0, _]) => w0,
+        }
+    }
+    /// That of the other layers.
+    pub fn others(self) -> f32 {
+        match self {
+            Self::All(w0) | Self::FirstAndOthers([_, w0]) => w0,
+        }
+    }
 }
 
 /// A similarity: first the scale, then the rotation, then the translation.
@@ -151,7 +206,23 @@ impl FieldOptions {
         if self.activation.is_some_and(|a| !a.is_valid()) {
             faults.push(fault("/activation", "out_of_range", "the activation's parameter is out of range"));
         }
+        let is_frequency = |w0: f32| Activation::Sine { w0 }.is_valid();
+        if self.w0.is_some_and(|w0| !is_frequency(w0.first()) || !is_frequency(w0.others())) {
+            faults.push(fault("/w0", "out_of_range", "a frequency is not from 0 to 10,000"));
+        }
+        if self.skip.is_some_and(|skip| !(skip.scale.abs() > 0.0 && skip.scale.is_finite())) {
+            faults.push(fault("/skip/scale", "out_of_range", "the factor is not a finite number other than 0"));
+        }
+        if self.scale.is_some_and(|s| !(MIN_SCALE..=MAX_SIZE).contains(&f64::from(s))) {
+            faults.push(fault("/scale", "out_of_range", "the scale is not from 1e-6 to 1e6"));
+        }
         faults
+    }
+
+    /// Faults for members that only fields with values of their own have.
+    pub(super) fn refuse_value_members(&self, kind: &str) -> Vec<Fault> {
+        let members = [("/sign", self.sign.is_some()), ("/scale", self.scale.is_some())];
+        not_offered(&members, kind)
     }
 
     /// Faults for members that only a network has.
@@ -160,12 +231,12 @@ impl FieldOptions {
             ("/latent", self.latent.is_some()),
             ("/latent_row", self.latent_row.is_some()),
             ("/activation", self.activation.is_some()),
+            ("/family", self.family.is_some()),
+            ("/w0", self.w0.is_some()),
+            ("/skip", self.skip.is_some()),
+            ("/encoding", self.encoding.is_some()),
         ];
-        members
-            .into_iter()
-            .filter(|m| m.1)
-            .map(|(pointer, _)| fault(pointer, "not_offered", format!("{kind} has no {}", &pointer[1..])))
-            .collect()
+        not_offered(&members, kind)
     }
 
     /// The latent code for a network. A network that comes with one code takes it unasked.
@@ -195,6 +266,11 @@ impl FieldOptions {
             Vec::new()
         })
     }
+}
+
+fn not_offered(members: &[(&str, bool)], kind: &str) -> Vec<Fault> {
+    let given = members.iter().filter(|member| member.1);
+    given.map(|(pointer, _)| fault(pointer, "not_offered", format!("{kind} has no {}", &pointer[1..]))).collect()
 }
 
 impl Transform {

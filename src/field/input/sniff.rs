@@ -3,7 +3,7 @@
 use crate::field::FieldError;
 use crate::field::grid::npy;
 use crate::field::mesh::MeshFormat;
-use crate::field::network::{niq, safetensors, zip};
+use crate::field::network::{folder, niq, onnx, safetensors, torch, zip};
 
 /// A format that is read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -14,14 +14,17 @@ pub enum Format {
     Safetensors,
     /// Neural weights as the npz of neural-implicit-queries.
     Npz,
+    /// Neural weights as a PyTorch checkpoint.
+    Torch,
+    /// Neural weights as a DeepSDF folder in a zip archive.
+    Folder,
+    /// Neural weights as an ONNX model.
+    Onnx,
     /// A sampled grid as npy.
     Grid,
     /// A mesh.
     Mesh(MeshFormat),
 }
-
-/// How a PyTorch file of version 1.5 or earlier begins: a pickled magic number.
-const PYTORCH_LEGACY: &[u8] = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19";
 
 impl Format {
     /// The format of the bytes.
@@ -30,16 +33,19 @@ impl Format {
     /// [`FieldError::Unsupported`] with the name of a format that is recognised and not read, and
     /// [`FieldError::Unrecognized`] for all else.
     pub fn detect(bytes: &[u8]) -> Result<Self, FieldError> {
-        let not_yet = |what: &str| Err(FieldError::Unsupported { detail: format!("{what} (not read yet)") });
         if zip::claims(bytes) {
             let entries = zip::entries(bytes)?;
             if niq::claims(&entries) {
                 return Ok(Self::Npz);
             }
-            if entries.iter().any(|e| e.name == "data.pkl" || e.name.ends_with("/data.pkl")) {
-                return not_yet("a PyTorch checkpoint");
+            if torch::claims_zip(&entries) {
+                return Ok(Self::Torch);
             }
-            let detail = "a zip archive that is neither a network of neural-implicit-queries nor a PyTorch checkpoint";
+            if folder::claims(&entries) {
+                return Ok(Self::Folder);
+            }
+            let detail = "a zip archive that is neither a network of neural-implicit-queries, nor a PyTorch checkpoint, nor a \
+                          folder with a specs.json";
             return Err(FieldError::Unsupported { detail: detail.to_owned() });
         }
         if npy::claims(bytes) {
@@ -48,8 +54,8 @@ impl Format {
         if safetensors::claims(bytes) {
             return Ok(Self::Safetensors);
         }
-        if bytes.starts_with(PYTORCH_LEGACY) {
-            return not_yet("a PyTorch checkpoint of version 1.5 or earlier");
+        if torch::claims_legacy(bytes) {
+            return Ok(Self::Torch);
         }
         let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
         if text.iter().find(|b| !b.is_ascii_whitespace()) == Some(&b'{') {
@@ -58,14 +64,15 @@ impl Format {
         if let Some(mesh) = MeshFormat::detect(bytes) {
             return Ok(Self::Mesh(mesh));
         }
-        if onnx_claims(bytes) {
-            return not_yet("an ONNX model");
+        if onnx::claims(bytes) {
+            return Ok(Self::Onnx);
         }
         if bytes.first() == Some(&0x80) && bytes.get(1).is_some_and(|v| (2..=5).contains(v)) {
-            return not_yet("a Python pickle");
+            let detail = "a Python pickle that no PyTorch wrote; nothing of it was run".to_owned();
+            return Err(FieldError::Unsupported { detail });
         }
         Err(FieldError::Unrecognized {
-            detail: "looked for a scene (JSON), a network (safetensors, npz), a mesh (PLY, OBJ, STL, OFF, GLB) and a grid (npy)"
+            detail: "looked for a scene (JSON), a network (safetensors, PyTorch, ONNX, npz), a mesh (PLY, OBJ, STL, OFF, GLB) and a grid (npy)"
                 .to_owned(),
         })
     }
@@ -76,14 +83,11 @@ impl Format {
             Self::Scene => "json",
             Self::Safetensors => "safetensors",
             Self::Npz => "npz",
+            Self::Torch => "torch",
+            Self::Folder => "deep_sdf_folder",
+            Self::Onnx => "onnx",
             Self::Grid => "npy",
             Self::Mesh(mesh) => mesh.name(),
         }
     }
-}
-
-/// Whether the bytes begin as the protocol buffer of an ONNX model: field 1, a small version, then a known field.
-fn onnx_claims(bytes: &[u8]) -> bool {
-    const FIELDS_OF_A_MODEL: [u8; 7] = [0x12, 0x1a, 0x22, 0x28, 0x32, 0x3a, 0x42];
-    matches!(bytes, [0x08, 1..=32, tag, ..] if FIELDS_OF_A_MODEL.contains(tag))
 }

@@ -96,6 +96,46 @@ impl Field for Transformed {
     }
 }
 
+/// A field whose values are multiplied.
+pub(super) struct Scaled {
+    inner: Box<dyn Field>,
+    factor: f32,
+}
+
+impl Scaled {
+    /// The field times `factor`, which is not 0; a negative one turns it inside out.
+    pub fn new(inner: Box<dyn Field>, factor: f32) -> Self {
+        Self { inner, factor }
+    }
+}
+
+impl Field for Scaled {
+    fn domain(&self) -> Domain {
+        self.inner.domain()
+    }
+    /// What is to be lengths is no promise of a distance.
+    fn metric(&self) -> Metric {
+        self.inner.metric().max(Metric::Bound)
+    }
+    fn lipschitz(&self) -> Option<f32> {
+        self.inner.lipschitz().map(|bound| bound * self.factor.abs())
+    }
+    fn dimension(&self) -> u8 {
+        self.inner.dimension()
+    }
+    fn values(&self, points: Points<'_>, values: &mut [f32]) {
+        self.inner.values(points, values);
+        values.iter_mut().for_each(|v| *v *= self.factor);
+    }
+    fn gradients(&self, points: Points<'_>, values: &mut [f32], gradients: Gradients<'_>) {
+        let Gradients { x, y, z } = gradients;
+        self.inner.gradients(points, values, Gradients { x: &mut *x, y: &mut *y, z: &mut *z });
+        for list in [values, x, y, z] {
+            list.iter_mut().for_each(|v| *v *= self.factor);
+        }
+    }
+}
+
 /// A field whose zero is another of its values.
 pub(super) struct Leveled {
     inner: Box<dyn Field>,

@@ -216,7 +216,7 @@ fn encode(encoding: Encoding, encoded: &mut [f32]) {
     for octave in rest.chunks_exact_mut(6 * TILE).take(frequencies as usize) {
         let (sines, cosines) = octave.split_at_mut(3 * TILE);
         for ((s, c), &x) in sines.iter_mut().zip(cosines).zip(&*coordinates) {
-            let (sine, cosine) = f64::from(w * x).sin_cos();
+            let (sine, cosine) = (w * f64::from(x)).sin_cos();
             (*s, *c) = (sine as f32, cosine as f32);
         }
         w *= 2.0;
@@ -232,7 +232,7 @@ fn decode(encoding: Encoding, encoded: &[f32], adjoint: &mut [f32]) {
     for (values, adjoints) in octaves.take(frequencies as usize) {
         for (i, to) in coordinates.iter_mut().enumerate() {
             let (sine, cosine) = (values[i], values[3 * TILE + i]);
-            *to += w * (cosine * adjoints[i] - sine * adjoints[3 * TILE + i]);
+            *to += w as f32 * (cosine * adjoints[i] - sine * adjoints[3 * TILE + i]);
         }
         w *= 2.0;
     }

@@ -118,7 +118,7 @@ pub fn read(
     let inputs = stack.layers[0].inputs;
     let nerf = family == Family::SirenNerf;
     let (encoding, latent_size) = input_of(family, inputs, specs, hints.encoding, &mut assumed)?;
-    let activations = activations(family, &stack, &mut assumed);
+    let activations = activations(family, &stack, specs, &mut assumed);
     let skip = skip_of(family);
     let mut layers = Vec::with_capacity(stack.layers.len() + 1);
     let mut previous = 0;
@@ -206,10 +206,6 @@ fn is_softplus(family: Family) -> bool {
     matches!(family, Family::Idr | Family::VolSdf | Family::Neus | Family::Igr)
 }
 
-fn is_deep_sdf(family: Family) -> bool {
-    matches!(family, Family::DeepSdf | Family::DeepSdfStruct)
-}
-
 /// The encoding and the size of the latent code that make so many inputs.
 fn input_of(
     family: Family,
@@ -225,7 +221,7 @@ fn input_of(
     let encoding = match (hint, octaves(inputs)) {
         (Some(encoding), _) => encoding,
         (None, Some(frequencies)) if family == Family::SirenNerf && frequencies <= MAX_FREQUENCIES => {
-            Encoding::Positional { frequencies, base: std::f32::consts::PI }
+            Encoding::Positional { frequencies, base: std::f64::consts::PI }
         }
         (None, Some(frequencies)) if is_softplus(family) && family != Family::Igr && frequencies <= MAX_FREQUENCIES => {
             assumed.push(format!("a point is encoded by {frequencies} octaves from 1 on (`encoding`)"));
@@ -254,7 +250,7 @@ fn input_of(
 }
 
 /// The activation of every layer.
-fn activations(family: Family, stack: &Stack, assumed: &mut Vec<String>) -> Vec<Activation> {
+fn activations(family: Family, stack: &Stack, specs: Option<&Specs>, assumed: &mut Vec<String>) -> Vec<Activation> {
     const W0: f32 = 30.0;
     const BETA: f32 = 100.0;
     let hidden = match family {
@@ -275,10 +271,8 @@ fn activations(family: Family, stack: &Stack, assumed: &mut Vec<String>) -> Vec<
             Activation::Relu
         }
     };
-    let last = match family {
-        Family::DeepSdf => Activation::Tanh,
-        _ => Activation::Identity,
-    };
+    let own_tanh = family == Family::DeepSdfStruct && specs.is_some_and(|s| s.network.use_tanh);
+    let last = if family == Family::DeepSdf || own_tanh { Activation::Tanh } else { Activation::Identity };
     if family == Family::DeepSdf {
         assumed.push("the output goes through a tanh".to_owned());
     }

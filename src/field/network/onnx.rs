@@ -31,7 +31,7 @@ mod wire;
 use super::Network;
 use crate::field::FieldError;
 
-const FORMAT: &str = "onnx";
+const FORMAT: &str = "ONNX";
 
 /// Whether the bytes begin as the protocol buffer of an ONNX model: a small version of the format, then a field of a model.
 pub(in crate::field) fn claims(bytes: &[u8]) -> bool {

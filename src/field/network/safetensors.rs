@@ -4,9 +4,11 @@
 //! `[outputs, inputs]` and `layers.i.bias` of shape `[outputs]`, and `latent_codes` of shape `[n, latent_size]` may come along.
 //! Numbers are F32 or F64. `docs/networks.md` describes the format for those who write it.
 
+use super::tensors::{Tensor, Tensors, bfloat, half};
 use super::{Activation, Encoding, Layer, MAX_LAYERS, MAX_PARAMETERS, Network, Skip};
 use crate::field::{Domain, FieldError, Metric};
-use safetensors::{Dtype, SafeTensors, tensor::TensorView};
+use safetensors::tensor::{Metadata, TensorView};
+use safetensors::{Dtype, SafeTensors};
 use std::collections::HashSet;
 
 const FORMAT: &str = "safetensors";
@@ -67,12 +69,34 @@ pub(in crate::field) fn claims(bytes: &[u8]) -> bool {
     bytes.get(8) == Some(&b'{') && bytes.first_chunk::<8>().is_some_and(|n| u64::from_le_bytes(*n) < 1 << 32)
 }
 
+/// The tensors of a file that has no architecture, by name; `None` where it has one.
+///
+/// # Errors
+/// As [`read`].
+pub fn tensors(bytes: &[u8]) -> Result<Option<Tensors>, FieldError> {
+    let (metadata, tensors) = open(bytes)?;
+    if metadata.metadata().as_ref().is_some_and(|m| m.contains_key("architecture")) {
+        return Ok(None);
+    }
+    let read = |(name, view): (String, TensorView<'_>)| {
+        let values = numbers(&name, &view)?;
+        Ok((name, Tensor { shape: view.shape().to_vec(), values }))
+    };
+    tensors.tensors().into_iter().map(read).collect::<Result<_, _>>().map(Some)
+}
+
 /// Reads a network.
 ///
 /// # Errors
 /// [`FieldError::Malformed`] that names the tensor or the byte, [`FieldError::Unsupported`] for safetensors without an
 /// architecture or with another version of it, and [`FieldError::Limit`].
 pub fn read(bytes: &[u8]) -> Result<Network, FieldError> {
+    let (metadata, tensors) = open(bytes)?;
+    read_own(&metadata, &tensors)
+}
+
+/// The header and the tensors, checked against the length of the file.
+fn open(bytes: &[u8]) -> Result<(Metadata, SafeTensors<'_>), FieldError> {
     let header = bytes.first_chunk::<8>().map(|n| u64::from_le_bytes(*n));
     let header = header.ok_or_else(|| fault(Some(0), "the file ends inside its header".to_owned()))?;
     if header > MAX_HEADER {
@@ -83,6 +107,10 @@ pub fn read(bytes: &[u8]) -> Result<Network, FieldError> {
     }
     let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|e| fault(None, e.to_string()))?;
     let tensors = SafeTensors::deserialize(bytes).map_err(|e| fault(None, e.to_string()))?;
+    Ok((metadata, tensors))
+}
+
+fn read_own(metadata: &Metadata, tensors: &SafeTensors<'_>) -> Result<Network, FieldError> {
     let text = metadata.metadata().as_ref().and_then(|m| m.get("architecture"));
     let text = text.ok_or_else(|| FieldError::Unsupported {
         detail: "safetensors without an architecture in the metadata".to_owned(),
@@ -158,6 +186,8 @@ fn numbers(name: &str, view: &TensorView<'_>) -> Result<Vec<f32>, FieldError> {
     let data = view.data();
     let list: Vec<f32> = match view.dtype() {
         Dtype::F32 => data.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect(),
+        Dtype::F16 => data.as_chunks().0.iter().map(|b| half(u16::from_le_bytes(*b))).collect(),
+        Dtype::BF16 => data.as_chunks().0.iter().map(|b| bfloat(u16::from_le_bytes(*b))).collect(),
         Dtype::F64 => data.as_chunks().0.iter().map(|b| f64::from_le_bytes(*b) as f32).collect(),
         other => return Err(FieldError::Unsupported { detail: format!("tensor {name:?} of type {other:?}") }),
     };

@@ -76,7 +76,7 @@ fn plainly(network: &Network, latent: &[f32], p: [f64; 3]) -> f64 {
     input.extend(p);
     if let Encoding::Positional { frequencies, base } = network.encoding {
         for k in 0..frequencies {
-            let w = f64::from(base) * f64::from(1u32 << k);
+            let w = base * f64::from(1u32 << k);
             input.extend(p.map(|x| (w * x).sin()));
             input.extend(p.map(|x| (w * x).cos()));
         }
@@ -152,7 +152,7 @@ fn every_activation_encoding_and_skip_gives_the_plain_value_and_its_gradient() {
         for (encoding, latent_size, skip) in [
             (Encoding::Identity, 0, None),
             (Encoding::Identity, 2, Some((2, 1.0))),
-            (Encoding::Positional { frequencies: 3, base: std::f32::consts::PI }, 3, Some((1, 0.70710677))),
+            (Encoding::Positional { frequencies: 3, base: std::f64::consts::PI }, 3, Some((1, 0.70710677))),
         ] {
             let network = made(&[24, 17, 30], activation, encoding, latent_size, skip);
             let latent: Vec<f32> = numbers(9).take(latent_size).collect();

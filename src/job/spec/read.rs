@@ -134,7 +134,22 @@ pub fn read_spec(value: &Value, faults: &mut Faults) -> JobSpec {
 /// Reads a field, or a weight, at `pointer`.
 fn read_field(value: &Value, pointer: &str, faults: &mut Faults) -> FieldSpec {
     let mut field = FieldSpec::default();
-    let known = ["scene", "input", "latent", "latent_row", "transform", "domain", "level", "activation"];
+    let known = [
+        "scene",
+        "input",
+        "latent",
+        "latent_row",
+        "transform",
+        "domain",
+        "level",
+        "activation",
+        "family",
+        "w0",
+        "skip",
+        "encoding",
+        "sign",
+        "scale",
+    ];
     let Some(object) = faults.object(value, pointer, &known) else { return field };
     match (object.get("scene"), object.get("input")) {
         (Some(scene), None) => field.scene = Some(scene.clone()),
@@ -157,6 +172,12 @@ fn read_field(value: &Value, pointer: &str, faults: &mut Faults) -> FieldSpec {
         domain: option(object, pointer, "domain", "\"fit\" or {\"min\": [x, y, z], \"max\": [x, y, z]}", faults),
         level: object.get("level").and_then(|level| faults.number(level, &format!("{pointer}/level"))),
         activation: option(object, pointer, "activation", "the name of an activation", faults),
+        family: option(object, pointer, "family", "the name of a family of networks", faults),
+        w0: option(object, pointer, "w0", "a frequency, or the first layer's and the others'", faults),
+        skip: option(object, pointer, "skip", "{\"scale\": number}", faults),
+        encoding: option(object, pointer, "encoding", "\"identity\" or {\"positional\": {frequencies, base}}", faults),
+        sign: option(object, pointer, "sign", "\"positive_outside\" or \"positive_inside\"", faults),
+        scale: object.get("scale").and_then(|scale| faults.number(scale, &format!("{pointer}/scale"))),
     };
     // what an option may be is known in the field's room
     if let Err(FieldError::Invalid { faults: wrong }) = field.options.check() {

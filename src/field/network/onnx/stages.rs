@@ -161,7 +161,7 @@ impl Stages {
         let (Some(highest), true) = (octaves.into_iter().max(), base <= 1e4) else {
             return none;
         };
-        let encoding = Encoding::Positional { frequencies: highest as u32 + 1, base: base as f32 };
+        let encoding = Encoding::Positional { frequencies: highest as u32 + 1, base };
         let place = |wave: &Wave| {
             let octave = octave(wave).unwrap_or(0);
             (latent_size + 3 + 6 * octave + if wave.cosine { 3 } else { 0 } + wave.axis, wave.sign)

@@ -5,6 +5,7 @@ use super::wire::Message;
 use super::{fault, quoted};
 use crate::field::FieldError;
 use crate::field::network::MAX_PARAMETERS;
+use crate::field::network::tensors::{bfloat, half};
 
 /// A constant, row-major. Whole numbers are exact up to 2^53, far beyond any index that is of use.
 #[derive(Clone, Debug, PartialEq)]
@@ -34,9 +35,9 @@ fn kind(number: i64) -> Option<Kind> {
         6 => Kind { size: 4, integer: true, list: 5, from_raw: |b| f64::from(i32::from_le_bytes(fixed(b))) },
         7 => Kind { size: 8, integer: true, list: 7, from_raw: |b| i64::from_le_bytes(fixed(b)) as f64 },
         9 => Kind { size: 1, integer: true, list: 5, from_raw: |b| f64::from(b[0]) },
-        10 => Kind { size: 2, integer: false, list: 5, from_raw: |b| half(u16::from_le_bytes(fixed(b))) },
+        10 => Kind { size: 2, integer: false, list: 5, from_raw: |b| half(u16::from_le_bytes(fixed(b))).into() },
         11 => Kind { size: 8, integer: false, list: 10, from_raw: |b| f64::from_le_bytes(fixed(b)) },
-        16 => Kind { size: 2, integer: false, list: 5, from_raw: |b| bfloat(u16::from_le_bytes(fixed(b))) },
+        16 => Kind { size: 2, integer: false, list: 5, from_raw: |b| bfloat(u16::from_le_bytes(fixed(b))).into() },
         _ => return None,
     };
     Some(kind)
@@ -44,23 +45,6 @@ fn kind(number: i64) -> Option<Kind> {
 
 fn fixed<const N: usize>(bytes: &[u8]) -> [u8; N] {
     std::array::from_fn(|i| bytes[i])
-}
-
-/// A number of half precision (IEEE 754 binary16).
-fn half(bits: u16) -> f64 {
-    let (exponent, fraction) = (i32::from(bits >> 10 & 31), f64::from(bits & 1023));
-    let size = match exponent {
-        0 => fraction * 2f64.powi(-24),
-        31 if fraction == 0.0 => f64::INFINITY,
-        31 => f64::NAN,
-        _ => (1024.0 + fraction) * 2f64.powi(exponent - 25),
-    };
-    if bits >> 15 == 1 { -size } else { size }
-}
-
-/// A number in the upper half of single precision (bfloat16).
-fn bfloat(bits: u16) -> f64 {
-    f64::from(f32::from_bits(u32::from(bits) << 16))
 }
 
 /// The name of an element type that is not read.
@@ -134,8 +118,8 @@ impl RawTensor<'_> {
             match (kind.list, self.kind) {
                 (4, _) => singles.into_iter().map(|b| f64::from(f32::from_le_bytes(b))).collect(),
                 (10, _) => doubles.into_iter().map(f64::from_le_bytes).collect(),
-                (_, 10) => ints.into_iter().map(|i| half(i as u16)).collect(),
-                (_, 16) => ints.into_iter().map(|i| bfloat(i as u16)).collect(),
+                (_, 10) => ints.into_iter().map(|i| half(i as u16).into()).collect(),
+                (_, 16) => ints.into_iter().map(|i| bfloat(i as u16).into()).collect(),
                 _ => ints.into_iter().map(|i| i as f64).collect(),
             }
         };
@@ -176,7 +160,7 @@ mod tests {
         for (bits, expected) in cases {
             assert_eq!(half(bits), expected, "{bits:x}");
         }
-        assert!(half(0x7c01).is_nan() && half(0xfc00) == f64::NEG_INFINITY);
+        assert!(half(0x7c01).is_nan() && half(0xfc00) == f32::NEG_INFINITY);
         assert_eq!(bfloat(0xc049), -3.140_625);
     }
 }

@@ -7,7 +7,7 @@ use super::globals::Kind;
 use super::pickle::Loaded;
 use super::{FORMAT, MAX_ELEMENTS, MAX_STORAGE_BYTES};
 use crate::field::FieldError;
-use crate::field::network::tensors::{Tensor, Tensors};
+use crate::field::network::tensors::{Tensor, Tensors, bfloat, half};
 use std::borrow::Cow;
 
 /// Numbers that lie outside the pickle.
@@ -156,7 +156,7 @@ fn decode(kind: Kind, bytes: &[u8], places: impl Iterator<Item = usize>, values:
     }
     match kind {
         Kind::F16 => all(bytes, places, values, |b| half(u16::from_le_bytes(b))),
-        Kind::Bf16 => all(bytes, places, values, |b| f32::from_bits(u32::from(u16::from_le_bytes(b)) << 16)),
+        Kind::Bf16 => all(bytes, places, values, |b| bfloat(u16::from_le_bytes(b))),
         Kind::F32 => all(bytes, places, values, f32::from_le_bytes),
         Kind::F64 => all(bytes, places, values, |b| f64::from_le_bytes(b) as f32),
         Kind::I8 => all(bytes, places, values, |b| f32::from(i8::from_le_bytes(b))),
@@ -165,17 +165,5 @@ fn decode(kind: Kind, bytes: &[u8], places: impl Iterator<Item = usize>, values:
         Kind::I32 => all(bytes, places, values, |b| i32::from_le_bytes(b) as f32),
         Kind::I64 => all(bytes, places, values, |b| i64::from_le_bytes(b) as f32),
         Kind::Bool => all(bytes, places, values, |[b]| f32::from(u8::from(b != 0))),
-    }
-}
-
-/// The value of a half-precision number (IEEE 754 binary16), which every `f32` can hold.
-fn half(bits: u16) -> f32 {
-    let sign = u32::from(bits & 0x8000) << 16;
-    let (exponent, fraction) = (u32::from(bits >> 10) & 0x1f, u32::from(bits) & 0x3ff);
-    match exponent {
-        // without a leading one: the fraction counts steps of 2^-24
-        0 => f32::from_bits(sign | (fraction as f32 / 16_777_216.0).to_bits()),
-        0x1f => f32::from_bits(sign | 0x7f80_0000 | fraction << 13),
-        _ => f32::from_bits(sign | (exponent + 127 - 15) << 23 | fraction << 13),
     }
 }
