@@ -1,9 +1,10 @@
 //! Neural signed distance fields: multilayer perceptrons from weight files, evaluated in batches with their gradients.
 //!
 //! A [`Network`] is what a file holds: dense layers with activations and skips, an encoding of the point, and perhaps a
-//! table of latent codes. [`Network::field`] folds one latent code into the biases and gives a [`NetworkField`]. Read are
-//! shrinkd's own safetensors ([`safetensors`]) and the npz files of neural-implicit-queries ([`niq`]); `docs/networks.md`
-//! describes both.
+//! table of latent codes. [`Network::field`] folds one latent code into the biases and gives a [`NetworkField`]. Some files say
+//! what they are: shrinkd's own safetensors ([`safetensors`]), the npz of neural-implicit-queries ([`niq`]), ONNX graphs
+//! ([`onnx`]). Others only hold named tensors ([`torch`], [`tensors`]), and [`family`] tells whose they are; [`folder`] is an
+//! experiment of DeepSDF. `docs/networks.md` describes them all.
 //!
 //! What a network returns is neither promised to be a distance nor a bound of one: unless its file says more, the field
 //! is [`Metric::Bound`] with an unknown Lipschitz bound.

@@ -111,7 +111,7 @@ async fn a_file_that_is_no_field_is_refused_when_it_arrives() {
         whole[..whole.len() / 2].to_vec()
     };
     let deep = [b"{\"round\": ".repeat(10_000), b"}".repeat(10_000)].concat();
-    let files: [(&str, Vec<u8>); 7] = [
+    let files: [(&str, Vec<u8>); 10] = [
         ("nothing", Vec::new()),
         ("noise", (0..4096u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 13) as u8).collect()),
         ("a broken scene", b"{\"sphere\": {\"radius\": ".to_vec()),
@@ -119,6 +119,9 @@ async fn a_file_that_is_no_field_is_refused_when_it_arrives() {
         ("a scene nested 10,000 deep", deep),
         ("a truncated npz", half("networks/blob.npz")),
         ("a truncated safetensors", half("networks/blob.safetensors")),
+        ("a truncated checkpoint", half("networks/families/blob_siren.pth")),
+        ("a truncated graph", half("networks/onnx/siren.onnx")),
+        ("a pickled module, which would have to be run", fixture("networks/torch/whole_module.pth")),
     ];
     for (what, bytes) in files {
         let response = upload(bytes).await.expect("an answer");

@@ -155,6 +155,45 @@ async fn an_uploaded_scene_is_described_and_used_by_its_hash() {
     assert_eq!(state(&app.ended(&id).await), "succeeded");
 }
 
+/// Uploads a network, wraps it with these members of its field, and returns its description and the job.
+async fn wrapped(app: &App, file: &str, members: Value) -> (Value, Value) {
+    let upload = app.request(Method::POST, "/v1/inputs").body(fixture(&format!("networks/{file}"))).send();
+    let input: Value = upload.await.expect("an answer").json().await.expect("JSON");
+    let mut request = small();
+    request["field"] = members;
+    request["field"]["input"] = input["id"].clone();
+    let id = app.submit(&request).await;
+    (input["description"].clone(), app.ended(&id).await)
+}
+
+#[tokio::test]
+async fn a_network_gives_the_same_surface_from_pytorch_as_from_our_own_format_once_it_is_said_what_no_file_says() {
+    let folder = tempfile::tempdir().expect("folder");
+    let app = App::start(folder.path());
+    for (own, theirs, family, members, said) in [
+        ("blob.safetensors", "families/blob_siren.pth", "siren", json!({}), json!({"w0": 12.0})),
+        (
+            "morph.safetensors",
+            "families/morph_igr.pth",
+            "igr",
+            json!({"latent_row": 2}),
+            json!({"latent_row": 2, "activation": {"softplus": {"beta": 20.0}}}),
+        ),
+    ] {
+        let (_, ours) = wrapped(&app, own, members).await;
+        let (description, job) = wrapped(&app, theirs, said).await;
+        assert_eq!((&description["format"], &description["family"]), (&json!("torch"), &json!(family)));
+        assert!(description["assumed"].as_array().is_some_and(|list| !list.is_empty()), "{description}");
+        assert_eq!(state(&job), "succeeded", "{job}");
+        let metrics = |job: &Value, name: &str| job["metrics"][name].clone();
+        assert_eq!(metrics(&job, "network")["family"], json!(family), "the report says what was detected: {job}");
+        for name in ["vertices", "evaluations", "normal_consistency", "distance"] {
+            assert_ne!(metrics(&job, name), Value::Null, "{name}");
+            assert_eq!(metrics(&job, name), metrics(&ours, name), "{theirs}: {name}");
+        }
+    }
+}
+
 #[tokio::test]
 async fn an_uploaded_network_is_described_and_wrapped_for_a_latent_code() {
     let folder = tempfile::tempdir().expect("folder");
