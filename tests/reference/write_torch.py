@@ -160,6 +160,9 @@ def main(folder):
         torch.save(value, folder / f"{name}.pth", pickle_protocol=protocol)
         stream = folder / f"{name}.legacy.pth"
         torch.save(value, stream, pickle_protocol=protocol, _use_new_zipfile_serialization=False)
+        # a pickled module comes with the place of its source, which is nobody's business
+        own = str(pathlib.Path(__file__).resolve()).encode()
+        stream.write_bytes(stream.read_bytes().replace(own, pathlib.Path(__file__).name.encode().rjust(len(own), b"/")))
         if not refused:
             loaded = torch.load(folder / f"{name}.pth", weights_only=False)
             entries = {
