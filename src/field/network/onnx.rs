@@ -1,8 +1,8 @@
 //! ONNX models of multilayer perceptrons, as exporters write them.
 //!
-//! The file is a protocol buffer ([`wire`] and [`model`] read the few messages that matter). Its graph is worked through
+//! The file is a protocol buffer (`wire` and `model` read the few messages that matter). Its graph is worked through
 //! symbolically: a value is either a constant, which is computed, or a tensor of affine forms in the network's inputs and in
-//! the outputs of activations ([`value`], [`forms`]). Every activation closes a [`stage`](stages); at the end the stages
+//! the outputs of activations (`value`, `forms`). Every activation closes a stage (`stages`); at the end the stages
 //! become the layers of a [`Network`]. So it does not matter how an exporter spells a dense layer, a skip, a sharpness or a
 //! weight norm, as long as the spelling is affine.
 //!
@@ -12,7 +12,7 @@
 //! input (residual connections), tensors outside the file, and functions of the model's own.
 //!
 //! Time and memory are in proportion to the file: what is computed from constants, and what forms are multiplied out, is
-//! counted against a [`Budget`](budget::Budget) of so much for every byte.
+//! counted against a budget of so much for every byte.
 
 mod arithmetic;
 mod axes;
