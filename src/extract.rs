@@ -346,7 +346,8 @@ mod tests {
         assert_eq!(made.report.attempts, Effort::ATTEMPTS);
         // folded triangles are first repaired where they are
         let repairs = parts.len() / 2 - Effort::ATTEMPTS as usize;
-        assert!((1..=(MOST_REPAIRS * Effort::ATTEMPTS) as usize).contains(&repairs), "{repairs} repairs");
+        let bounds = [REPAIRS, MOST_REPAIRS].map(|each| (each * Effort::ATTEMPTS) as usize);
+        assert!((bounds[0]..=bounds[1]).contains(&repairs), "{repairs} repairs");
         let counted = made.report.evaluations.value + made.report.evaluations.gradient;
         assert_eq!(counted, spent, "the evaluations of all attempts are counted");
         assert!(news.windows(2).all(|w| w[0].fraction <= w[1].fraction), "progress never falls");

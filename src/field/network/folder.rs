@@ -83,7 +83,9 @@ pub fn pack(folder: &Path) -> std::io::Result<Vec<u8>> {
         }
         names.extend(found.into_iter().map(|name| format!("{part}/{name}")));
     }
-    let files = names.iter().map(|name| Ok((name.as_str(), std::fs::read(folder.join(name))?)));
+    let named = |name: &str, error: std::io::Error| std::io::Error::new(error.kind(), format!("{name}: {error}"));
+    let files =
+        names.iter().map(|name| Ok((name.as_str(), std::fs::read(folder.join(name)).map_err(|e| named(name, e))?)));
     let files = files.collect::<std::io::Result<Vec<_>>>()?;
     zip_of(&files)
 }
