@@ -10,12 +10,14 @@
 //! is [`Metric::Bound`] with an unknown Lipschitz bound.
 
 mod activation;
+pub mod adjoint;
 mod evaluate;
 pub mod family;
 pub mod folder;
 mod functions;
 pub mod niq;
 pub mod onnx;
+mod passes;
 mod product;
 pub mod safetensors;
 pub mod tensors;
@@ -126,6 +128,30 @@ impl Network {
     /// Number of weights and biases; latent codes are not counted.
     pub fn parameters(&self) -> usize {
         self.layers.iter().map(|layer| layer.weights.len() + layer.bias.len()).sum()
+    }
+
+    /// All weights and biases: layer by layer, the weights row by row, then the biases.
+    pub fn weights(&self) -> Vec<f32> {
+        self.layers.iter().flat_map(|layer| layer.weights.iter().chain(&layer.bias).copied()).collect()
+    }
+
+    /// Replaces all weights and biases; the list is as [`Network::weights`] gives it.
+    ///
+    /// # Panics
+    /// When the list has another length than [`Network::parameters`].
+    pub fn set_weights(&mut self, list: &[f32]) {
+        assert_eq!(list.len(), self.parameters());
+        let mut rest = list;
+        for part in self.layers.iter_mut().flat_map(|layer| [&mut layer.weights, &mut layer.bias]) {
+            let (taken, after) = rest.split_at(part.len());
+            part.copy_from_slice(taken);
+            rest = after;
+        }
+    }
+
+    /// Whether a layer is given the network's input: the first one, and those with a skip.
+    fn sees_input(&self, layer: usize) -> bool {
+        layer == 0 || self.layers[layer].skip.is_some()
     }
 
     /// Number of latent codes that come with the network.

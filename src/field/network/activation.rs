@@ -62,6 +62,19 @@ impl Activation {
         self.widest(row, Some(derivative));
     }
 
+    /// Multiplies every number by the second derivative, which the activation `value` and its derivative `slope` tell.
+    pub(super) fn multiply_by_curvature(self, row: &mut [f32], value: &[f32], slope: &[f32]) {
+        let all = row.iter_mut().zip(value).zip(slope);
+        match self {
+            Self::Identity | Self::Relu => row.fill(0.0),
+            Self::Elu => all.for_each(|((r, &v), &s)| *r *= if v < 0.0 { s } else { 0.0 }),
+            Self::Tanh => all.for_each(|((r, &v), &s)| *r *= -2.0 * v * s),
+            Self::Sigmoid => all.for_each(|((r, &v), &s)| *r *= s * (1.0 - 2.0 * v)),
+            Self::Sine { w0 } => all.for_each(|((r, &v), _)| *r *= -w0 * w0 * v),
+            Self::Softplus { beta } => all.for_each(|((r, _), &s)| *r *= beta * s * (1.0 - s)),
+        }
+    }
+
     /// Chooses the loops that were compiled for the widest registers. Their bits are the same for every width.
     fn widest(self, row: &mut [f32], derivative: Option<&mut [f32]>) {
         #[cfg(target_arch = "x86_64")]
@@ -208,6 +221,23 @@ mod tests {
                     (f64::from(derivatives[i]) - slope).abs() < (1e-6 + rounding) * scale,
                     "{activation:?}' at {x}"
                 );
+            }
+        }
+    }
+
+    #[test]
+    fn curvature_is_the_slope_of_the_slope() {
+        for activation in ALL {
+            for x in (-40..40).map(|i| (i as f32 + 0.5) / 20.0) {
+                let h = 1e-3;
+                let mut arguments = [x - h, x, x + h];
+                let mut slopes = arguments;
+                activation.apply_with_derivative(&mut arguments, &mut slopes);
+                let mut curvature = [1.0];
+                activation.multiply_by_curvature(&mut curvature, &arguments[1..2], &slopes[1..2]);
+                let (expected, found) = (f64::from(slopes[2] - slopes[0]) / f64::from(2.0 * h), f64::from(curvature[0]));
+                let tolerance = if let Activation::Sine { w0 } = activation { 2e-3 * f64::from(w0 * w0) } else { 2e-2 };
+                assert!((expected - found).abs() < tolerance, "{activation:?} at {x}: {expected} {found}");
             }
         }
     }

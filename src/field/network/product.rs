@@ -97,6 +97,63 @@ pub(super) fn multiply(
     }
 }
 
+/// Numbers of a matrix as [`outer`] sums it up: whole products of a panel's rows with a tile's.
+pub(super) fn outer_size(rows: usize, columns: usize) -> usize {
+    padded(rows) * columns.next_multiple_of(TILE)
+}
+
+/// Where [`outer`] puts the product of a row with a column.
+pub(super) fn outer_place(rows: usize, row: usize, column: usize) -> usize {
+    ((column / TILE * padded(rows)) + row) * TILE + column % TILE
+}
+
+/// Numbers of scratch that [`outer`] takes.
+pub(super) fn outer_scratch(columns: usize, tiles: usize) -> usize {
+    tiles * TILE * (columns.next_multiple_of(TILE) + ROWS)
+}
+
+/// Adds to `to` the sums over all points of the products of a row of the block `left` with one of the block `right`: the derivatives
+/// by a layer's weights, of what it was given and what came back. Blocks are as for [`multiply`], of so many features; `to` is as
+/// [`outer_place`] says.
+pub(super) fn outer(
+    (left, rows): (&[f32], usize),
+    (right, columns): (&[f32], usize),
+    tiles: usize,
+    scratch: &mut [f32],
+    to: &mut [f32],
+) {
+    let (points, kernel) = (tiles * TILE, Kernel::detect());
+    let (across, panel) = scratch[..outer_scratch(columns, tiles)].split_at_mut(points * columns.next_multiple_of(TILE));
+    // both sides are turned over, so that the points are what the kernel sums over
+    for (part, across) in across.chunks_exact_mut(points * TILE).enumerate() {
+        let first = part * TILE;
+        let here = first..(first + TILE).min(columns);
+        for (tile, across) in across.chunks_exact_mut(TILE * TILE).enumerate() {
+            let from = &right[(tile * padded(columns) + first) * TILE..][..here.len() * TILE];
+            turn(from, here.len(), TILE, across);
+        }
+    }
+    for first in (0..rows).step_by(ROWS) {
+        for (tile, panel) in panel.chunks_exact_mut(TILE * ROWS).enumerate() {
+            turn(&left[(tile * padded(rows) + first) * TILE..][..SUMS], ROWS, ROWS, panel);
+        }
+        for (part, across) in across.chunks_exact(points * TILE).enumerate() {
+            let at = outer_place(rows, first, part * TILE);
+            let sums: &mut [f32; SUMS] = (&mut to[at..at + SUMS]).try_into().expect("a slice of that length");
+            kernel.add(panel, across, sums);
+        }
+    }
+}
+
+/// Turns `rows` rows of [`TILE`] numbers into [`TILE`] rows of `width`, of which the first `rows` numbers are written.
+fn turn(from: &[f32], rows: usize, width: usize, to: &mut [f32]) {
+    for (lane, to) in to.chunks_exact_mut(width).enumerate() {
+        for (number, row) in to.iter_mut().zip(from.chunks_exact(TILE).take(rows)) {
+            *number = row[lane];
+        }
+    }
+}
+
 /// A version of the kernel that this processor can run.
 #[derive(Clone, Copy)]
 enum Kernel {
