@@ -7,6 +7,7 @@ pub mod compare;
 pub mod evaluate;
 pub mod extract;
 pub mod first_job;
+pub mod fit;
 pub mod healthcheck;
 mod interrupt;
 mod options;
@@ -17,6 +18,7 @@ use crate::field::input::{DomainName, DomainOption, FieldOptions};
 use crate::measure::chart::SphereChart;
 use crate::shrink::lattice::LatticeSpec;
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use indicatif::{ProgressBar, ProgressStyle};
 use options::{ShrinkArgs, parse_lattice};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -52,6 +54,9 @@ enum Command {
     /// Wrap every field of a folder and write a table of how good the results are
     #[command(after_long_help = COMPARE_EXAMPLES)]
     Compare(CompareArgs),
+    /// Fit a network to meshes: one gives a SIREN, several an auto-decoder with a latent code each
+    #[command(after_long_help = fit::EXAMPLES)]
+    Fit(fit::FitArgs),
     /// Print the description of the service (OpenAPI 3.1, YAML)
     Openapi,
     /// Ask a service whether it is ready: exits 0 when it is
@@ -296,6 +301,7 @@ pub fn run() -> ExitCode {
         Command::Extract(args) => extract::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Compare(args) => compare::run(&args),
+        Command::Fit(args) => fit::run(&args),
         Command::Openapi => openapi(),
         Command::Healthcheck { url } => healthcheck::run(&url),
     }
@@ -309,6 +315,18 @@ fn openapi() -> ExitCode {
         }
         Err(error) => fail(FAILED, &error),
     }
+}
+
+/// Steps of a progress bar.
+const STEPS: u64 = 1000;
+
+/// A bar on a terminal, nothing elsewhere.
+fn progress_bar() -> ProgressBar {
+    let bar = ProgressBar::new(STEPS);
+    if let Ok(style) = ProgressStyle::with_template("{bar:40} {percent:>3} % {msg} {elapsed}") {
+        bar.set_style(style);
+    }
+    bar
 }
 
 /// Says on standard error what is wrong.

@@ -7,6 +7,7 @@ pub mod config;
 pub mod engine;
 pub mod extract;
 pub mod field;
+pub mod fit;
 pub mod http;
 pub mod job;
 pub mod measure;

@@ -1,19 +1,15 @@
 //! `shrinkd extract`: one field in, files out, and one line that says how good they are.
 
-use super::{BAD_INPUT, BAD_USAGE, ExtractArgs, FAILED, NOT_WRAPPED, fail};
+use super::{BAD_INPUT, BAD_USAGE, ExtractArgs, FAILED, NOT_WRAPPED, STEPS, fail, progress_bar};
 use crate::job::failure::{Ended, Failure};
 use crate::job::pipeline::{self, Asked, CurveMade, Made, Opened};
 use crate::job::spec::{FieldSpec, OutputName};
 use crate::measure::verdict::Finding;
 use crate::settings::{CancelToken, Progress, Settings};
 use crate::shrink::{Density, ShrinkSpec};
-use indicatif::{ProgressBar, ProgressStyle};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Instant;
-
-/// Steps of the bar.
-const STEPS: u64 = 1000;
 
 /// Places that are printed of each fault.
 const PLACES: usize = 4;
@@ -141,15 +137,6 @@ fn wanted(args: &ExtractArgs) -> Vec<(OutputName, PathBuf)> {
 
 fn write(path: &Path, bytes: &[u8]) -> Result<(), (u8, String)> {
     std::fs::write(path, bytes).map_err(|e| (FAILED, format!("{}: {e}", path.display())))
-}
-
-/// A bar on a terminal, nothing elsewhere.
-fn progress_bar() -> ProgressBar {
-    let bar = ProgressBar::new(STEPS);
-    if let Ok(style) = ProgressStyle::with_template("{bar:40} {percent:>3} % {msg} {elapsed}") {
-        bar.set_style(style);
-    }
-    bar
 }
 
 fn name(path: &Path) -> std::borrow::Cow<'_, str> {

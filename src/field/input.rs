@@ -161,6 +161,20 @@ pub fn open(bytes: &[u8], options: &FieldOptions) -> Result<Opened, FieldError> 
     }
 }
 
+/// Reads a mesh from the bytes of any known format of meshes.
+///
+/// # Errors
+/// [`FieldError::Unsupported`] for a field of another kind, otherwise what the format's reader says.
+pub fn open_mesh(bytes: &[u8]) -> Result<MeshField, FieldError> {
+    match Format::detect(bytes)? {
+        Format::Mesh(_) => MeshField::new(TriangleMesh::read(bytes)?),
+        other => {
+            let detail = format!("a network is fitted to meshes, and this is {}", other.name());
+            Err(FieldError::Unsupported { detail })
+        }
+    }
+}
+
 /// Says what the bytes hold, having read and checked them as [`open`] would.
 ///
 /// # Errors

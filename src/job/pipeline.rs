@@ -9,6 +9,7 @@ use super::spec::{FieldSpec, OutputName};
 use crate::blobs::BlobId;
 use crate::extract::{Budget, Extracted, Part, extract};
 use crate::field::input::{self, Description};
+use crate::field::mesh::MeshField;
 use crate::field::network::family::Detected;
 use crate::field::sampler::Tally;
 use crate::field::scene::Scene;
@@ -146,6 +147,11 @@ pub fn open(spec: &FieldSpec, bytes: Option<&[u8]>, at: &str) -> Result<Opened, 
     // the bytes of a scene in a request are its JSON without spaces, members in alphabetical order
     let provenance = json!({"sha256": BlobId::of(bytes).hex(), "bytes": bytes.len(), "options": spec.options});
     Ok(Opened { field, weight: None, provenance, detected })
+}
+
+/// Opens a mesh that a network is fitted to.
+pub fn open_mesh(bytes: &[u8]) -> Result<MeshField, Box<Failure>> {
+    input::open_mesh(bytes).map_err(|e| Box::new(Failure::from_field(&e, "")))
 }
 
 impl Opened {

@@ -235,7 +235,8 @@ mod tests {
                 activation.apply_with_derivative(&mut arguments, &mut slopes);
                 let mut curvature = [1.0];
                 activation.multiply_by_curvature(&mut curvature, &arguments[1..2], &slopes[1..2]);
-                let (expected, found) = (f64::from(slopes[2] - slopes[0]) / f64::from(2.0 * h), f64::from(curvature[0]));
+                let (expected, found) =
+                    (f64::from(slopes[2] - slopes[0]) / f64::from(2.0 * h), f64::from(curvature[0]));
                 let tolerance = if let Activation::Sine { w0 } = activation { 2e-3 * f64::from(w0 * w0) } else { 2e-2 };
                 assert!((expected - found).abs() < tolerance, "{activation:?} at {x}: {expected} {found}");
             }

@@ -4,9 +4,9 @@
 //! [`Sums`] gather the loss's derivatives by all weights. Gradients take no second derivatives by the point: b . grad f is the
 //! derivative of f along b, so one pass forward along b, and the pass back through it, are all there is to it.
 
+use super::Network;
 use super::passes::{Biases, Packed, TILES, decode, encode, encode_along, place};
 use super::product::{TILE, outer, outer_place, outer_scratch, outer_size, padded};
-use super::Network;
 use crate::field::Points;
 use std::ops::Range;
 
@@ -78,30 +78,55 @@ impl Sums {
         }
     }
 
-    /// Adds the sums to `weights`, the derivatives by all weights and biases in the order of [`Network::weights`], and to
-    /// `latent`, those by the latent code that the points were seen with.
-    pub fn add_to(&self, network: &Network, code: &[f32], weights: &mut [f32], latent: &mut [f32]) {
+    /// Adds the sums of other points to these.
+    pub fn merge(&mut self, other: &Self) {
+        for (layer, from) in self.layers.iter_mut().zip(&other.layers) {
+            let lists =
+                [(&mut layer.previous, &from.previous), (&mut layer.point, &from.point), (&mut layer.bias, &from.bias)];
+            for (to, from) in lists {
+                to.iter_mut().zip(from).for_each(|(to, from)| *to += from);
+            }
+        }
+    }
+
+    /// Adds what goes through the latent code `code`, which all points of the sums must have been seen with: to `weights` the
+    /// derivatives by the weights that meet it, to `latent` those by the code itself. The order is that of [`Network::weights`].
+    pub fn add_code_to(&self, network: &Network, code: &[f32], weights: &mut [f32], latent: &mut [f32]) {
+        let (mut at, mut previous) = (0, 0);
+        for (i, (layer, sums)) in network.layers.iter().zip(&self.layers).enumerate() {
+            let scale = layer.skip.map_or(1.0, |s| s.scale);
+            if network.sees_input(i) {
+                let rows = layer.weights.chunks_exact(layer.inputs());
+                for ((row, own), sum) in rows.enumerate().zip(&sums.bias) {
+                    let first = at + row * layer.inputs() + previous;
+                    let codes = weights[first..first + code.len()].iter_mut().zip(code);
+                    codes.for_each(|(to, z)| *to += scale * sum * z);
+                    latent.iter_mut().zip(&own[previous..]).for_each(|(to, w)| *to += scale * sum * w);
+                }
+            }
+            at += layer.weights.len() + layer.bias.len();
+            previous = layer.outputs();
+        }
+    }
+
+    /// Adds the derivatives by all weights and biases to `weights`, but for those by the weights that meet a latent code.
+    pub fn add_to(&self, network: &Network, weights: &mut [f32]) {
         let (mut rest, mut previous) = (weights, 0);
         for (i, (layer, sums)) in network.layers.iter().zip(&self.layers).enumerate() {
             let (rows, inputs) = (layer.outputs(), layer.inputs());
             let (matrix, after) = rest.split_at_mut(rows * inputs);
             let (bias, after) = after.split_at_mut(rows);
             let scale = layer.skip.map_or(1.0, |s| s.scale);
-            let codes = if network.sees_input(i) { code } else { &[] };
+            let point = if network.sees_input(i) { previous + network.latent_size } else { inputs };
             for (row, to) in matrix.chunks_exact_mut(inputs).enumerate() {
-                let (of_previous, of_input) = to.split_at_mut(previous);
-                let (of_code, of_point) = of_input.split_at_mut(codes.len());
-                for (column, to) in of_previous.iter_mut().enumerate() {
+                for (column, to) in to[..previous].iter_mut().enumerate() {
                     *to += scale * sums.previous[outer_place(rows, row, column)];
                 }
-                for (column, to) in of_point.iter_mut().enumerate() {
+                for (column, to) in to[point..].iter_mut().enumerate() {
                     *to += scale * sums.point[outer_place(rows, row, column)];
                 }
-                of_code.iter_mut().zip(codes).for_each(|(to, z)| *to += scale * sums.bias[row] * z);
-                bias[row] += sums.bias[row];
-                let own = &layer.weights[row * inputs + previous..][..codes.len()];
-                latent.iter_mut().zip(own).for_each(|(to, w)| *to += scale * sums.bias[row] * w);
             }
+            bias.iter_mut().zip(&sums.bias).for_each(|(to, sum)| *to += sum);
             (rest, previous) = (after, rows);
         }
     }
@@ -204,7 +229,11 @@ impl<'n> Prepared<'n> {
             let mut at = 0;
             for (activation, outputs_of) in packed.layers() {
                 let these = at..at + tiles * TILE * outputs_of;
-                activation.multiply_by_curvature(&mut bend[these.clone()], &outputs[these.clone()], &slopes[these.clone()]);
+                activation.multiply_by_curvature(
+                    &mut bend[these.clone()],
+                    &outputs[these.clone()],
+                    &slopes[these.clone()],
+                );
                 at = these.end;
             }
             for ((bend, back), slope) in bend.iter_mut().zip(&mut *back).zip(&*slopes) {
@@ -225,7 +254,9 @@ impl<'n> Prepared<'n> {
             let slopes = &slopes[at..at + piece.len()];
             match gradients {
                 false => piece.iter_mut().zip(slopes).for_each(|(g, slope)| *g *= slope),
-                true => piece.iter_mut().zip(slopes).zip(&bend[at..]).for_each(|((g, slope), bend)| *g = *g * slope + bend),
+                true => {
+                    piece.iter_mut().zip(slopes).zip(&bend[at..]).for_each(|((g, slope), bend)| *g = *g * slope + bend)
+                }
             }
         };
         let mut offset = all;

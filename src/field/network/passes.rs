@@ -143,14 +143,7 @@ impl Packed {
 
     /// Carries a direction forward: `tangents` are the derivatives of all layers' outputs along it, `inner` those of what their
     /// activations were taken of, where `encoded` has that of the encoded points, and `derivatives` those of the activations.
-    pub fn along(
-        &self,
-        tiles: usize,
-        encoded: &[f32],
-        derivatives: &[f32],
-        inner: &mut [f32],
-        tangents: &mut [f32],
-    ) {
+    pub fn along(&self, tiles: usize, encoded: &[f32], derivatives: &[f32], inner: &mut [f32], tangents: &mut [f32]) {
         let (mut at, mut previous) = (0, 0);
         for layer in &self.layers {
             let (before, rest) = tangents.split_at_mut(at);

@@ -123,7 +123,8 @@ pub(super) fn outer(
     to: &mut [f32],
 ) {
     let (points, kernel) = (tiles * TILE, Kernel::detect());
-    let (across, panel) = scratch[..outer_scratch(columns, tiles)].split_at_mut(points * columns.next_multiple_of(TILE));
+    let (across, panel) =
+        scratch[..outer_scratch(columns, tiles)].split_at_mut(points * columns.next_multiple_of(TILE));
     // both sides are turned over, so that the points are what the kernel sums over
     for (part, across) in across.chunks_exact_mut(points * TILE).enumerate() {
         let first = part * TILE;

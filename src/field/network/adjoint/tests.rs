@@ -69,7 +69,8 @@ fn derivatives(network: &Network, places: &[Vec<f32>; 3], gradients: bool) -> (V
         }
     });
     let (mut weights, mut latent) = (vec![0.0; network.parameters()], vec![0.0; CODE.len()]);
-    sums.add_to(network, &CODE, &mut weights, &mut latent);
+    sums.add_to(network, &mut weights);
+    sums.add_code_to(network, &CODE, &mut weights, &mut latent);
     (weights, latent)
 }
 
