@@ -181,6 +181,29 @@ impl Blobs {
         }
     }
 
+    /// Writes the checkpoint of a job over the one before. Whoever writes it, it is the state of the same computation.
+    pub async fn put_checkpoint(&self, job: &str, bytes: Bytes) -> Result<(), BlobError> {
+        self.store.put(&checkpoint_path(job), bytes.into()).await?;
+        Ok(())
+    }
+
+    /// The checkpoint of a job, if it has one.
+    pub async fn checkpoint(&self, job: &str) -> Result<Option<Bytes>, BlobError> {
+        match self.store.get(&checkpoint_path(job)).await {
+            Ok(found) => Ok(Some(found.bytes().await?)),
+            Err(object_store::Error::NotFound { .. }) => Ok(None),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    /// Removes the checkpoint of a job; one that is not there is no error.
+    pub async fn remove_checkpoint(&self, job: &str) -> Result<(), BlobError> {
+        match self.store.delete(&checkpoint_path(job)).await {
+            Ok(()) | Err(object_store::Error::NotFound { .. }) => Ok(()),
+            Err(error) => Err(error.into()),
+        }
+    }
+
     /// Whether the store answers.
     pub async fn health(&self) -> Result<(), BlobError> {
         self.store.list_with_delimiter(None).await?;
@@ -195,6 +218,10 @@ impl Blobs {
             Err(error) => Err(error.into()),
         }
     }
+}
+
+fn checkpoint_path(job: &str) -> Path {
+    Path::from_iter(["checkpoints", job])
 }
 
 fn blob_path(id: BlobId) -> Path {

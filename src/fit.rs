@@ -284,7 +284,7 @@ impl<'a> Trainer<'a> {
         });
         self.weights.fill(0.0);
         self.codes.fill(0.0);
-        let penalty = f64::from(spec.latent_penalty) * (done / PENALTY_RISE).min(1.0);
+        let penalty = spec.latent_penalty * (done / PENALTY_RISE).min(1.0);
         let mut loss = 0.0;
         for slot in &*slots {
             loss += slot.loss;
@@ -302,7 +302,7 @@ impl<'a> Trainer<'a> {
             first.sums.add_to(network, &mut self.weights);
         }
         let rise = (done / WARM_UP).min(1.0);
-        let rate = f64::from(spec.learning_rate) * rise * 0.5 * (1.0 + (std::f64::consts::PI * done).cos());
+        let rate = spec.learning_rate * rise * 0.5 * (1.0 + (std::f64::consts::PI * done).cos());
         state.steps += 1;
         let adam = Adam::new(rate, state.steps);
         adam.step(&mut state.weights, &self.weights);
@@ -332,7 +332,8 @@ impl Slot {
         sums.clear();
         *loss = 0.0;
         let share = 1.0 / count as f32;
-        let gradients = spec.normal > 0.0 || spec.eikonal > 0.0;
+        let (normal, eikonal) = (spec.normal as f32, spec.eikonal as f32);
+        let gradients = normal > 0.0 || eikonal > 0.0;
         prepared.sum(code, Points { x, y, z }, gradients, sums, |these, asked: &mut Asked| {
             let mut sum = 0.0f64;
             for (k, i) in these.enumerate() {
@@ -342,14 +343,13 @@ impl Slot {
                 if gradients {
                     let g: [f32; 3] = std::array::from_fn(|a| asked.gradients[a][k]);
                     let length = (g[0] * g[0] + g[1] * g[1] + g[2] * g[2]).sqrt().max(1e-6);
-                    let (turned, stretched) =
-                        (2.0 * spec.normal * share, 2.0 * spec.eikonal * share * (1.0 - 1.0 / length));
+                    let (turned, stretched) = (2.0 * normal * share, 2.0 * eikonal * share * (1.0 - 1.0 / length));
                     for a in 0..3 {
                         let miss = g[a] - normals[a][i];
-                        sum += f64::from(spec.normal * miss * miss);
+                        sum += f64::from(normal * miss * miss);
                         asked.by_gradient[a][k] = turned * miss + stretched * g[a];
                     }
-                    sum += f64::from(spec.eikonal * (length - 1.0) * (length - 1.0));
+                    sum += f64::from(eikonal * (length - 1.0) * (length - 1.0));
                 }
             }
             *loss += sum * f64::from(share);

@@ -59,6 +59,25 @@ pub enum JobKind {
     /// Shrink a sphere onto a field.
     #[default]
     Shrink,
+    /// Fit a network to meshes.
+    Fit,
+}
+
+impl JobKind {
+    /// All of them.
+    pub const ALL: [JobKind; 2] = [JobKind::Shrink, JobKind::Fit];
+
+    /// The name in JSON and in the database.
+    pub fn name(self) -> &'static str {
+        match self {
+            JobKind::Shrink => "shrink",
+            JobKind::Fit => "fit",
+        }
+    }
+    /// The kind of that name.
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|kind| kind.name() == name)
+    }
 }
 
 /// Where a job is in its life: `queued -> running -> (canceling) -> succeeded | failed | canceled`.
@@ -110,7 +129,8 @@ impl State {
 #[serde(default)]
 pub struct ProgressView {
     /// Name of the stage: `topology`, then in every attempt `contract`, `remesh`, `map`, `resample`, `untangle`, `slide`, `sharpen`,
-    /// `separate` and `measure`, then `relax` (with `relax_uv`) and `write`; the method `paper` has `shrink` before `measure`.
+    /// `separate` and `measure`, then `relax` (with `relax_uv`) and `write`; the method `paper` has `shrink` before `measure`. A fit has
+    /// `sample`, `train` and `measure`.
     pub stage: String,
     /// Number of the attempt at the surface, from 1 (not of the worker's, which the job counts); 0 before the first.
     pub attempt: u32,
@@ -120,7 +140,7 @@ pub struct ProgressView {
     pub iterations: u32,
     /// Share of the job done, from 0 to 1.
     pub fraction: f32,
-    /// Energy per unit area of the stage's objective.
+    /// Energy per unit area of the stage's objective; of a fit the mean of the loss in this epoch.
     pub energy: Option<f64>,
     /// Largest known distance from the front to the zero level set, scene units.
     pub max_distance: Option<f64>,
@@ -133,7 +153,7 @@ pub struct ProgressView {
 /// One finished output of a job.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Output {
-    /// Its name: `glb`, `surface`, `svg`, `preview` or `report`.
+    /// Its name: `glb`, `surface`, `svg`, `preview`, `network` or `report`.
     pub name: String,
     /// Where it is downloaded.
     pub href: String,
@@ -143,7 +163,8 @@ pub struct Output {
     pub bytes: u64,
     /// SHA-256 of its bytes, lower-case hexadecimal; also its strong `ETag`.
     pub sha256: String,
-    /// Whether the surface in it passed every check of its verdict (in the report). One that did not is kept for looking at.
+    /// Whether the surface in it passed every check of its verdict (in the report). One that did not is kept for looking at. Of
+    /// a fit: whether every mesh has a zero level set in the network.
     #[serde(default)]
     pub certified: bool,
 }
@@ -172,14 +193,18 @@ pub struct Job {
     pub finished_at: Option<Timestamp>,
     /// Names the client gave it.
     pub labels: BTreeMap<String, String>,
-    /// How it is shrunk.
-    pub shrink: crate::shrink::ShrinkSpec,
+    /// How it is shrunk, where the kind is `shrink`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub shrink: Option<crate::shrink::ShrinkSpec>,
+    /// How it is fitted, where the kind is `fit`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fit: Option<crate::fit::FitSpec>,
     /// How far it has come, once it runs.
     pub progress: Option<ProgressView>,
     /// Seconds the rest may take.
     pub eta_s: Option<f64>,
     /// What was measured about the result: the same object as the output `report`. A job that failed with `not_certified`
-    /// has it too, about the best surface that was made.
+    /// has it too, about the best surface that was made. A fit has its own report.
     // kept as a value, so that records of another version can still be shown
     #[schema(value_type = Option<crate::measure::AnyReport>)]
     pub metrics: Option<serde_json::Value>,

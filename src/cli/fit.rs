@@ -66,16 +66,16 @@ pub struct FitArgs {
     pub batch: u32,
     /// Learning rate at its highest; it falls along a cosine
     #[arg(long, value_name = "RATE", default_value_t = FitSpec::default().learning_rate)]
-    pub learning_rate: f32,
+    pub learning_rate: f64,
     /// Weight of (grad f - grad d)^2 beside |f - d|
     #[arg(long, value_name = "WEIGHT", default_value_t = FitSpec::default().normal)]
-    pub normal: f32,
+    pub normal: f64,
     /// Weight of (|grad f| - 1)^2 beside |f - d|
     #[arg(long, value_name = "WEIGHT", default_value_t = FitSpec::default().eikonal)]
-    pub eikonal: f32,
+    pub eikonal: f64,
     /// Weight of |z|^2, the squared length of the latent codes
     #[arg(long, value_name = "WEIGHT", default_value_t = FitSpec::default().latent_penalty)]
-    pub latent_penalty: f32,
+    pub latent_penalty: f64,
     /// Seed of all that is random
     #[arg(long, value_name = "N", default_value_t = FitSpec::default().seed)]
     pub seed: u64,
@@ -225,7 +225,7 @@ fn fitted(args: &FitArgs) -> Result<(), (u8, String)> {
 fn open(path: &Path) -> Result<(MeshField, String), (u8, String)> {
     let wrong = |e: &dyn std::fmt::Display| (BAD_INPUT, format!("{}: {e}", path.display()));
     let bytes = std::fs::read(path).map_err(|e| wrong(&e))?;
-    let mesh = open_mesh(&bytes).map_err(|failure| wrong(&failure.detail))?;
+    let mesh = open_mesh(&bytes, "").map_err(|failure| wrong(&failure.detail))?;
     Ok((mesh, BlobId::of(&bytes).hex()))
 }
 

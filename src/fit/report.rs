@@ -28,7 +28,7 @@ pub struct FitReport {
     /// Weights and biases of the network.
     pub parameters: u64,
     /// Mean of the loss in every epoch, in parts of the longest half side of the domain.
-    pub losses: Vec<f32>,
+    pub losses: Vec<f64>,
     /// One for every mesh, in the order they were given.
     pub shapes: Vec<ShapeReport>,
     /// Version of the program.
@@ -63,7 +63,7 @@ pub(super) fn measure(
     Ok(FitReport {
         fit: *spec,
         parameters: network.parameters() as u64,
-        losses: losses.to_vec(),
+        losses: losses.iter().map(|&loss| loss.into()).collect(),
         shapes,
         version: env!("CARGO_PKG_VERSION").to_owned(),
     })

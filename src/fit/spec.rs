@@ -43,13 +43,13 @@ pub struct FitSpec {
     /// Samples of a step, from 384 to 262,144; the next multiple of 384 is taken.
     pub batch: u32,
     /// Learning rate at its highest, up to 1.
-    pub learning_rate: f32,
+    pub learning_rate: f64,
     /// Weight of (grad f - grad d)^2 beside the distance's error; 0 for none.
-    pub normal: f32,
+    pub normal: f64,
     /// Weight of (|grad f| - 1)^2; 0 for none.
-    pub eikonal: f32,
+    pub eikonal: f64,
     /// Weight of |z|^2, the squared length of the latent codes.
-    pub latent_penalty: f32,
+    pub latent_penalty: f64,
     /// Seed of all that is random.
     pub seed: u64,
 }

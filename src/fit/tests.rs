@@ -117,7 +117,7 @@ fn a_wild_learning_rate_is_told_and_a_raised_token_ends_it() {
         let training = Training { spec: &small(), from: None, checkpoint: &|_| {} };
         assert_eq!(fit(&meshes, training, settings).unwrap_err(), FitError::Canceled);
     });
-    let faults = FitSpec { learning_rate: f32::NAN, layers: 0, normal: -1.0, ..small() }.faults();
+    let faults = FitSpec { learning_rate: f64::NAN, layers: 0, normal: -1.0, ..small() }.faults();
     let pointers: Vec<&str> = faults.iter().map(|f| f.pointer.as_str()).collect();
     assert_eq!(pointers, ["/layers", "/learning_rate", "/normal"]);
 }

@@ -28,6 +28,11 @@ pub struct Input {
 }
 
 impl Input {
+    /// Whether it is a mesh.
+    pub(super) fn is_mesh(&self) -> bool {
+        matches!(self.description, Description::Mesh { .. })
+    }
+
     /// 3 for surfaces, 2 for curves.
     pub(super) fn dimension(&self) -> u8 {
         match self.description {

@@ -1,10 +1,11 @@
 //! `/v1/jobs`: submit, look, cancel, forget.
 
-use super::{App, Problem, body, conditional, inputs, query};
+use super::inputs::{self, Input};
+use super::{App, Problem, body, conditional, query};
 use crate::blobs::BlobId;
 use crate::engine::{Forgotten, IdempotencyKey, NewJob, Submitted};
 use crate::field::{Fault, FieldError};
-use crate::job::spec::FieldSpec;
+use crate::job::spec::{FieldSpec, Fitting, Work};
 use crate::job::{Failure, Job, JobId, JobSpec, pipeline};
 use crate::shrink::Method;
 use axum::Json;
@@ -218,6 +219,7 @@ pub async fn forget(
             for blob in unused.iter().filter_map(|hex| BlobId::from_hex(hex)) {
                 app.blobs.remove(blob).await?;
             }
+            app.blobs.remove_checkpoint(&id.to_string()).await?;
             tracing::info!(job.id = %id, "job forgotten");
             Ok(StatusCode::NO_CONTENT)
         }
@@ -279,8 +281,15 @@ fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, Problem> {
 
 /// Checks what the field and the weight name. Tells the field's dimension.
 async fn check_fields(app: &App, spec: &JobSpec) -> Result<u8, Problem> {
-    let dimension = check_field(app, &spec.field, "/field").await?;
-    if let Some(weight) = &spec.weight
+    let work = match &spec.work {
+        Work::Shrink(work) => work,
+        Work::Fit(fitting) => {
+            check_meshes(app, &fitting.meshes).await?;
+            return Ok(3);
+        }
+    };
+    let dimension = check_field(app, &work.field, "/field").await?;
+    if let Some(weight) = &work.weight
         && check_field(app, weight, "/weight").await? != 3
     {
         let detail = "a weight is a field of dimension 3".to_owned();
@@ -290,15 +299,32 @@ async fn check_fields(app: &App, spec: &JobSpec) -> Result<u8, Problem> {
     Ok(dimension)
 }
 
+/// What an input holds that is named at `pointer`.
+async fn described(app: &App, id: BlobId, pointer: &str) -> Result<Input, Problem> {
+    let Some(note) = app.blobs.note(id).await? else {
+        let detail = format!("no input {id} is stored; upload it to /v1/inputs first");
+        let fault = Fault { pointer: pointer.to_owned(), code: "unknown_input", detail };
+        return Err(Problem::invalid_request("", &[fault]));
+    };
+    inputs::read_note(&note)
+}
+
+/// Checks that the inputs which a fit names are there, and meshes.
+async fn check_meshes(app: &App, meshes: &[BlobId]) -> Result<(), Problem> {
+    for (i, &id) in meshes.iter().enumerate() {
+        let pointer = format!("/meshes/{i}");
+        if !described(app, id, &pointer).await?.is_mesh() {
+            let detail = format!("{id} is no mesh, and a network is fitted to meshes");
+            return Err(Problem::invalid_request("", &[Fault { pointer, code: "not_a_mesh", detail }]));
+        }
+    }
+    Ok(())
+}
+
 /// Checks what a field names, at `pointer`: the scene in the request, or the input that must be there. Tells its dimension.
 async fn check_field(app: &App, field: &FieldSpec, pointer: &'static str) -> Result<u8, Problem> {
     if let Some(id) = field.input {
-        let Some(note) = app.blobs.note(id).await? else {
-            let detail = format!("no input {id} is stored; upload it to /v1/inputs first");
-            let fault = Fault { pointer: format!("{pointer}/input"), code: "unknown_input", detail };
-            return Err(Problem::invalid_request("", &[fault]));
-        };
-        return Ok(inputs::read_note(&note)?.dimension());
+        return Ok(described(app, id, &format!("{pointer}/input")).await?.dimension());
     }
     let Some(scene) = field.scene.clone() else { return Ok(3) };
     // a scene may be large: checked off the runtime
@@ -314,16 +340,24 @@ async fn check_field(app: &App, field: &FieldSpec, pointer: &'static str) -> Res
 }
 
 fn estimate(spec: &JobSpec, dimension: u8) -> Estimate {
+    let shrink = match &spec.work {
+        Work::Shrink(work) => &work.shrink,
+        Work::Fit(Fitting { meshes, fit }) => {
+            // of the meshes' distances; the network is evaluated as often in every epoch
+            let evaluations = meshes.len() as u64 * u64::from(fit.samples);
+            return Estimate { valid: true, vertices: 0, evaluations };
+        }
+    };
     if dimension == 2 {
-        let vertices = u64::from(spec.shrink.curve_samples());
-        let evaluations = match spec.shrink.method {
+        let vertices = u64::from(shrink.curve_samples());
+        let evaluations = match shrink.method {
             Method::Adaptive => CONTOUR_EVALUATIONS + vertices,
             Method::Paper => CURVE_PAPER_EVALUATIONS * vertices,
         };
         return Estimate { valid: true, vertices, evaluations };
     }
-    let vertices = spec.shrink.lattice.vertices();
-    let per_vertex = match spec.shrink.method {
+    let vertices = shrink.lattice.vertices();
+    let per_vertex = match shrink.method {
         Method::Adaptive => ADAPTIVE_EVALUATIONS,
         Method::Paper => PAPER_EVALUATIONS,
     };
@@ -340,13 +374,58 @@ pub enum SubmitAnswer {
     Estimate(Estimate),
 }
 
-/// A request for a job, as it may be sent: only the field is required. [`JobSpec`] is the same with every default filled in.
+/// A request for a job, as it may be sent.
+#[derive(Serialize, utoipa::ToSchema)]
+#[serde(untagged)]
+pub enum JobRequest {
+    /// For a surface.
+    Shrink(Box<ShrinkRequest>),
+    /// For a network.
+    Fit(FitRequest),
+}
+
+/// The kind of a [`ShrinkRequest`].
+#[derive(Serialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum ShrinkKind {
+    /// Shrink a sphere onto a field.
+    Shrink,
+}
+
+/// The kind of a [`FitRequest`].
+#[derive(Serialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum FitKind {
+    /// Fit a network to meshes.
+    Fit,
+}
+
+/// A request for a network: only the kind and the meshes are required.
 #[derive(Serialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
-pub struct JobRequest {
+pub struct FitRequest {
+    /// What kind of work it is.
+    kind: FitKind,
+    /// The names of uploaded meshes: one gives a SIREN, several (at most 1,024) an auto-decoder with a latent code each, in this order.
+    meshes: Vec<String>,
+    /// How it is fitted.
+    #[schema(required = false)]
+    fit: crate::fit::FitSpec,
+    /// What is made; `network` and `report` when nothing is said.
+    #[schema(required = false)]
+    outputs: Vec<crate::job::OutputName>,
+    /// Names to find the job by: at most 16.
+    #[schema(required = false)]
+    labels: std::collections::BTreeMap<String, String>,
+}
+
+/// A request for a surface: only the field is required. [`JobSpec`] is the same with every default filled in.
+#[derive(Serialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ShrinkRequest {
     /// What kind of work it is.
     #[schema(required = false)]
-    kind: crate::job::JobKind,
+    kind: ShrinkKind,
     /// The field.
     field: FieldSpec,
     /// What samples are spread by, where the density is `weight`: its values, which need not be distances.

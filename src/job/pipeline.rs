@@ -1,7 +1,9 @@
 //! From bytes to outputs: the one place where the job room meets the numeric rooms.
 
+mod fitting;
 mod plane;
 
+pub use fitting::{Kept, open_mesh, run_fit};
 pub use plane::{CurveMade, make_curve};
 
 use super::failure::{Ended, Failure};
@@ -9,7 +11,6 @@ use super::spec::{FieldSpec, OutputName};
 use crate::blobs::BlobId;
 use crate::extract::{Budget, Extracted, Part, extract};
 use crate::field::input::{self, Description};
-use crate::field::mesh::MeshField;
 use crate::field::network::family::Detected;
 use crate::field::sampler::Tally;
 use crate::field::scene::Scene;
@@ -68,7 +69,7 @@ impl Made {
     }
 }
 
-/// What a field made, of either dimension.
+/// What a job made, of any kind.
 pub struct Finished {
     /// The report.
     pub metrics: Value,
@@ -149,11 +150,6 @@ pub fn open(spec: &FieldSpec, bytes: Option<&[u8]>, at: &str) -> Result<Opened, 
     Ok(Opened { field, weight: None, provenance, detected })
 }
 
-/// Opens a mesh that a network is fitted to.
-pub fn open_mesh(bytes: &[u8]) -> Result<MeshField, Box<Failure>> {
-    input::open_mesh(bytes).map_err(|e| Box::new(Failure::from_field(&e, "")))
-}
-
 impl Opened {
     /// The same with a weight, opened like a field and pointed to below `at`.
     pub fn with_weight(mut self, spec: &FieldSpec, bytes: Option<&[u8]>, at: &str) -> Result<Self, Box<Failure>> {
@@ -219,8 +215,8 @@ pub fn make(opened: &Opened, asked: &Asked<'_>, settings: Settings<'_>) -> Resul
         Ok(match output {
             OutputName::Glb => surface::gltf::to_glb(&surface, &lasting, &opened.provenance),
             OutputName::Surface => surface::tensors::to_safetensors(&surface),
-            OutputName::Svg => {
-                let detail = "svg is made of fields of dimension 2, and this one has dimension 3";
+            OutputName::Svg | OutputName::Network => {
+                let detail = format!("{} is not made of a field of dimension 3", output.name());
                 return Err(Failure::new("dimension", "the field has the wrong dimension for this", detail).into());
             }
             OutputName::Preview => surface::preview::to_png(&surface, PREVIEW_WIDTH, &settings)?,

@@ -5,10 +5,12 @@
 
 mod read;
 
+use super::JobKind;
 use crate::blobs::BlobId;
 use crate::extract::Budget;
 use crate::field::Fault;
 use crate::field::input::FieldOptions;
+use crate::fit::FitSpec;
 use crate::shrink::ShrinkSpec;
 use crate::shrink::curve::{MAX_SAMPLES, MIN_SAMPLES};
 use crate::shrink::lattice::LatticeSpec;
@@ -46,14 +48,31 @@ pub enum OutputName {
     Svg,
     /// The surface from four sides, or the curve, as PNG.
     Preview,
+    /// The network that was fitted, as safetensors with its architecture.
+    Network,
     /// Everything measured, as JSON.
     Report,
 }
 
 impl OutputName {
     /// All of them.
-    pub const ALL: [OutputName; 5] =
-        [OutputName::Glb, OutputName::Surface, OutputName::Svg, OutputName::Preview, OutputName::Report];
+    pub const ALL: [OutputName; 6] = [
+        OutputName::Glb,
+        OutputName::Surface,
+        OutputName::Svg,
+        OutputName::Preview,
+        OutputName::Network,
+        OutputName::Report,
+    ];
+
+    /// Those that jobs of a kind can make.
+    pub fn of(kind: JobKind) -> &'static [OutputName] {
+        use OutputName::{Glb, Network, Preview, Report, Surface, Svg};
+        match kind {
+            JobKind::Shrink => &[Glb, Surface, Svg, Preview, Report],
+            JobKind::Fit => &[Network, Report],
+        }
+    }
 
     /// The name in JSON and in URLs.
     pub fn name(self) -> &'static str {
@@ -62,6 +81,7 @@ impl OutputName {
             OutputName::Surface => "surface",
             OutputName::Svg => "svg",
             OutputName::Preview => "preview",
+            OutputName::Network => "network",
             OutputName::Report => "report",
         }
     }
@@ -74,7 +94,7 @@ impl OutputName {
         match self {
             OutputName::Glb => "model/gltf-binary",
             // no registered type; the one the format's own tools use is octet-stream
-            OutputName::Surface => "application/octet-stream",
+            OutputName::Surface | OutputName::Network => "application/octet-stream",
             OutputName::Svg => "image/svg+xml",
             OutputName::Preview => "image/png",
             OutputName::Report => "application/json",
@@ -84,7 +104,7 @@ impl OutputName {
     pub fn extension(self) -> &'static str {
         match self {
             OutputName::Glb => "glb",
-            OutputName::Surface => "safetensors",
+            OutputName::Surface | OutputName::Network => "safetensors",
             OutputName::Svg => "svg",
             OutputName::Preview => "png",
             OutputName::Report => "json",
@@ -109,24 +129,70 @@ pub struct FieldSpec {
 }
 
 /// A checked request for a job.
-#[derive(Clone, Debug, PartialEq, Serialize, utoipa::ToSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct JobSpec {
+    /// What is to be done.
+    #[serde(flatten)]
+    pub work: Work,
+    /// What is made: `glb`, `preview` and `report` of a surface, `svg` too of a 2-D field, `network` and `report` of a fit when nothing
+    /// is said.
+    pub outputs: Vec<OutputName>,
+    /// Names the client gives the job; jobs can be listed by them.
+    pub labels: BTreeMap<String, String>,
+}
+
+/// What a job does, by its kind.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub enum Work {
+    /// Shrinks a sphere onto a field.
+    Shrink(Box<Shrinking>),
+    /// Fits a network to meshes.
+    Fit(Fitting),
+}
+
+impl Work {
+    /// The uploaded inputs that it names, in the order of the request: of a surface those of its field and its weight.
+    pub fn inputs(&self) -> Vec<BlobId> {
+        match self {
+            Self::Shrink(work) => {
+                let weight = work.weight.as_ref().and_then(|weight| weight.input);
+                work.field.input.into_iter().chain(weight).collect()
+            }
+            Self::Fit(fitting) => fitting.meshes.clone(),
+        }
+    }
+
     /// What kind of work it is.
-    pub kind: super::JobKind,
+    pub fn kind(&self) -> JobKind {
+        match self {
+            Self::Shrink(_) => JobKind::Shrink,
+            Self::Fit(_) => JobKind::Fit,
+        }
+    }
+}
+
+/// Meshes, and how a network is fitted to them.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Fitting {
+    /// The names of uploaded meshes: one gives a SIREN, several an auto-decoder with a latent code each, in this order.
+    pub meshes: Vec<BlobId>,
+    /// How it is fitted.
+    pub fit: FitSpec,
+}
+
+/// A field, and how a sphere is shrunk onto it.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Shrinking {
     /// The field.
     pub field: FieldSpec,
     /// What samples are spread by, where the density is `weight`: its values, which need not be distances.
     #[serde(skip_serializing_if = "Option::is_none")]
-    #[schema(required = false)]
     pub weight: Option<FieldSpec>,
     /// How it is shrunk.
     pub shrink: ShrinkSpec,
     /// What may be spent on it.
     pub budget: Budget,
-    /// What is made; `glb`, `preview` and `report` when nothing is said, and `svg` of a 2-D field.
-    pub outputs: Vec<OutputName>,
-    /// Names the client gives the job; jobs can be listed by them.
-    pub labels: BTreeMap<String, String>,
 }
 
 impl JobSpec {
@@ -145,8 +211,9 @@ impl JobSpec {
     /// Fits a request to the dimension of its field: what only curves have is refused for surfaces, and what a request that
     /// says nothing gets is completed. `request` is what the spec was read from.
     pub fn for_dimension(mut self, dimension: u8, request: &Value) -> Result<Self, Vec<Fault>> {
+        let Work::Shrink(shrinking) = &self.work else { return Ok(self) };
         if dimension == 2 {
-            if self.weight.is_some() {
+            if shrinking.weight.is_some() {
                 let detail = "samples of a curve are spread by arc length, not by a weight";
                 return Err(vec![Fault {
                     pointer: "/weight".to_owned(),
@@ -166,7 +233,7 @@ impl JobSpec {
             let detail = "svg is made of fields of dimension 2, and this one has dimension 3";
             faults.add(format!("/outputs/{i}"), "dimension", detail);
         }
-        if self.shrink.samples.is_some() {
+        if shrinking.shrink.samples.is_some() {
             let detail = "samples are those of a curve, and this field has dimension 3: it takes a lattice";
             faults.add("/shrink/samples", "dimension", detail);
         }

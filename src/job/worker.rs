@@ -5,12 +5,14 @@
 
 use super::failure::{Ended, Failure};
 use super::preview::MeshPreview;
+use super::spec::{FieldSpec, Work};
 use super::{EventKind, Output, OutputName, ProgressView};
 use crate::blobs::{BlobError, BlobId, Blobs};
 use crate::engine::{Claim, Engine, EngineError, Outcome, Renewal, Update};
-use crate::job::pipeline::{self, Asked};
+use crate::job::pipeline::{self, Asked, Kept};
 use crate::settings::{CancelToken, Progress, Settings};
 use bytes::Bytes;
+use std::cell::Cell;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
@@ -22,6 +24,8 @@ use tracing::Instrument as _;
 const PROGRESS_EVERY: Duration = Duration::from_millis(100);
 /// Least time between two mesh events of a job.
 const MESH_EVERY: Duration = Duration::from_millis(250);
+/// Least time between two checkpoints of a job.
+const CHECKPOINT_EVERY: Duration = Duration::from_secs(5);
 /// How long a worker that found nothing to do waits before it asks again; a new job wakes it at once.
 const CLAIM_WAIT: Duration = Duration::from_secs(20);
 /// Pause after the engine failed, so that a broken disk does not make a busy loop.
@@ -150,7 +154,14 @@ impl Worker {
             Err(Ended::Canceled) if returning => Outcome::Released,
             Err(Ended::Canceled) => Outcome::Canceled,
         };
+        let over = !matches!(outcome, Outcome::Released);
         self.end(&claim, outcome).await;
+        if over
+            && matches!(claim.spec.work, Work::Fit(_))
+            && let Err(error) = self.blobs.remove_checkpoint(&claim.id.to_string()).await
+        {
+            tracing::warn!(%error, "the checkpoint of an ended job could not be removed");
+        }
         drop(promise);
     }
 
@@ -172,27 +183,57 @@ impl Worker {
         let (blobs, pool) = (self.blobs.clone(), self.pool.clone());
         async move {
             let clock = Instant::now();
-            let input = read_input(&blobs, claim.spec.field.input).await?;
-            let weight = read_input(&blobs, claim.spec.weight.as_ref().and_then(|weight| weight.input)).await?;
-            let span = tracing::Span::current();
+            let (spec, name) = (claim.spec, claim.id.to_string());
+            let mut inputs = Vec::new();
+            for id in spec.work.inputs() {
+                inputs.push(read_input(&blobs, id).await?);
+            }
+            let before = match spec.work {
+                Work::Fit(_) => blobs.checkpoint(&name).await.unwrap_or_else(|error| {
+                    tracing::warn!(%error, "the checkpoint could not be read; training begins anew");
+                    None
+                }),
+                Work::Shrink(_) => None,
+            };
+            let (span, runtime) = (tracing::Span::current(), tokio::runtime::Handle::current());
             let compute = move || {
                 let _entered = span.enter();
-                let mut opened = pipeline::open(&claim.spec.field, input.as_deref(), "/field")?;
-                if let Some(spec) = &claim.spec.weight {
-                    opened = opened.with_weight(spec, weight.as_deref(), "/weight")?;
-                }
-                cancel.check()?;
                 let teller = Teller::new(news);
                 let progress = |progress: Progress| teller.tell(progress);
                 let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress };
-                let spec = &claim.spec;
-                let asked = Asked {
-                    shrink: &spec.shrink,
-                    budget: spec.budget,
-                    outputs: &spec.outputs,
-                    load_seconds: clock.elapsed().as_secs_f64(),
-                };
-                pipeline::run(&opened, &asked, settings)
+                match &spec.work {
+                    Work::Shrink(work) => {
+                        let mut inputs = inputs.iter();
+                        let mut next = |field: &FieldSpec| field.input.and_then(|_| inputs.next()).map(Bytes::as_ref);
+                        let mut opened = pipeline::open(&work.field, next(&work.field), "/field")?;
+                        if let Some(weight) = &work.weight {
+                            opened = opened.with_weight(weight, next(weight), "/weight")?;
+                        }
+                        cancel.check()?;
+                        let asked = Asked {
+                            shrink: &work.shrink,
+                            budget: work.budget,
+                            outputs: &spec.outputs,
+                            load_seconds: clock.elapsed().as_secs_f64(),
+                        };
+                        pipeline::run(&opened, &asked, settings)
+                    }
+                    Work::Fit(fitting) => {
+                        // one after the first epoch, then one every few seconds
+                        let last = Cell::new(None::<Instant>);
+                        let keep = |bytes: &dyn Fn() -> Vec<u8>| {
+                            if last.get().is_some_and(|last| last.elapsed() < CHECKPOINT_EVERY) {
+                                return;
+                            }
+                            if let Err(error) = runtime.block_on(blobs.put_checkpoint(&name, bytes().into())) {
+                                tracing::warn!(%error, "a checkpoint could not be written");
+                            }
+                            last.set(Some(Instant::now()));
+                        };
+                        let kept = Kept { before: before.as_deref(), keep: &keep };
+                        pipeline::run_fit(fitting, &inputs, &spec.outputs, &kept, &settings)
+                    }
+                }
             };
             tokio::task::spawn_blocking(compute).await.unwrap_or_else(|panic| {
                 tracing::error!(%panic, "the computation panicked");
@@ -255,11 +296,10 @@ impl Worker {
     }
 }
 
-/// The bytes of an input that a job names, if it names one.
-async fn read_input(blobs: &Blobs, id: Option<BlobId>) -> Result<Option<Bytes>, Failure> {
-    let Some(id) = id else { return Ok(None) };
+/// The bytes of an input that a job names.
+async fn read_input(blobs: &Blobs, id: BlobId) -> Result<Bytes, Failure> {
     match blobs.get(id).await {
-        Ok(bytes) => Ok(Some(bytes)),
+        Ok(bytes) => Ok(bytes),
         Err(BlobError::Missing) => {
             let detail = format!("no input {id} is stored");
             Err(Failure::new("unknown_input", "the input is not there", detail))

@@ -9,6 +9,7 @@ mod control;
 mod curves;
 mod evaluate;
 mod faults;
+mod fit;
 mod losses;
 mod metrics;
 mod refusals;

@@ -1,6 +1,7 @@
 //! Rows and what they mean: records, events, and the changes that keep both together.
 
 use crate::engine::{Claim, EventPage, ListQuery, NewJob, Page, Renewal, Update};
+use crate::job::spec::Work;
 use crate::job::{Event, EventKind, Failure, Job, JobId, JobKind, Output, ProgressView, State};
 use jiff::Timestamp;
 use rusqlite::types::Value as Sql;
@@ -55,8 +56,8 @@ fn time(ms: i64) -> rusqlite::Result<Timestamp> {
 }
 
 const COLUMNS: &str =
-    "id, state, attempt, revision, created_at, started_at, finished_at, labels, shrink, progress, metrics,
-    outputs, problem, last_seq";
+    "id, state, attempt, revision, created_at, started_at, finished_at, labels, settings, progress, metrics,
+    outputs, problem, last_seq, kind";
 
 fn job_of(row: &Row<'_>) -> rusqlite::Result<Job> {
     let json = |column: usize| row.get::<_, Option<String>>(column);
@@ -67,9 +68,16 @@ fn job_of(row: &Row<'_>) -> rusqlite::Result<Job> {
         "state".to_owned(),
         rusqlite::types::Type::Text,
     ))?;
+    let kind: String = row.get(14)?;
+    let kind = JobKind::from_name(&kind).ok_or(rusqlite::Error::InvalidColumnType(
+        14,
+        "kind".to_owned(),
+        rusqlite::types::Type::Text,
+    ))?;
+    let settings: String = row.get(8)?;
     Ok(Job {
         id: row.get::<_, String>(0)?.parse().map_err(corrupt)?,
-        kind: JobKind::Shrink,
+        kind,
         state,
         attempt: row.get(2)?,
         revision: row.get(3)?,
@@ -77,7 +85,8 @@ fn job_of(row: &Row<'_>) -> rusqlite::Result<Job> {
         started_at: row.get::<_, Option<i64>>(5)?.map(time).transpose()?,
         finished_at: row.get::<_, Option<i64>>(6)?.map(time).transpose()?,
         labels: from_json(&row.get::<_, String>(7)?)?,
-        shrink: from_json(&row.get::<_, String>(8)?)?,
+        shrink: (kind == JobKind::Shrink).then(|| from_json(&settings)).transpose()?,
+        fit: (kind == JobKind::Fit).then(|| from_json(&settings)).transpose()?,
         eta_s: progress.as_ref().and_then(|p| p.eta_s).filter(|_| !state.ended()),
         progress,
         metrics: json(10)?.as_deref().map(from_json).transpose()?,
@@ -93,9 +102,14 @@ pub(super) fn read(connection: &Connection, id: JobId) -> rusqlite::Result<Optio
 
 pub(super) fn insert(ctx: &mut Ctx<'_>, new: &NewJob) -> rusqlite::Result<()> {
     let (id, spec) = (new.id.to_string(), &new.spec);
+    let settings = match &spec.work {
+        Work::Shrink(shrinking) => to_json(&shrinking.shrink)?,
+        Work::Fit(fitting) => to_json(&fitting.fit)?,
+    };
     ctx.connection.execute(
-        "INSERT INTO jobs (id, state, created_at, spec, labels, shrink) VALUES (?1, 'queued', ?2, ?3, ?4, ?5)",
-        params![id, ctx.now, to_json(spec)?, to_json(&spec.labels)?, to_json(&spec.shrink)?],
+        "INSERT INTO jobs (id, state, created_at, spec, labels, kind, settings)
+         VALUES (?1, 'queued', ?2, ?3, ?4, ?5, ?6)",
+        params![id, ctx.now, to_json(spec)?, to_json(&spec.labels)?, spec.work.kind().name(), settings],
     )?;
     for (name, value) in &spec.labels {
         let label = "INSERT INTO labels (job, name, value) VALUES (?1, ?2, ?3)";

@@ -4,7 +4,8 @@ use crate::engine::EngineError;
 use rusqlite::Connection;
 
 /// One step per version; `user_version` counts the steps that were taken. A step is never edited once released.
-const MIGRATIONS: [&str; 1] = ["
+const MIGRATIONS: [&str; 2] = [
+    "
     CREATE TABLE jobs (
         id          TEXT PRIMARY KEY,
         state       TEXT NOT NULL,
@@ -55,7 +56,12 @@ const MIGRATIONS: [&str; 1] = ["
         expires_at  INTEGER NOT NULL
     ) STRICT;
     CREATE INDEX idempotency_by_age ON idempotency (expires_at);
-"];
+",
+    "
+    ALTER TABLE jobs ADD COLUMN kind TEXT NOT NULL DEFAULT 'shrink';
+    ALTER TABLE jobs RENAME COLUMN shrink TO settings;
+",
+];
 
 /// Brings the file to this version.
 pub(super) fn migrate(connection: &mut Connection) -> Result<(), EngineError> {

@@ -1,14 +1,19 @@
 //! Reads a request, member by member, and collects its faults.
 
 use super::{
-    FieldSpec, JobSpec, MAX_LABEL_NAME, MAX_LABEL_VALUE, MAX_LABELS, MAX_LATENT, OutputName, SAMPLES, check_lattice,
+    FieldSpec, Fitting, JobSpec, MAX_LABEL_NAME, MAX_LABEL_VALUE, MAX_LABELS, MAX_LATENT, OutputName, SAMPLES,
+    Shrinking, Work, check_lattice,
 };
+use crate::blobs::BlobId;
 use crate::extract::Budget;
 use crate::field::input::FieldOptions;
 use crate::field::{Fault, FieldError, type_name};
+use crate::fit::FitSpec;
+use crate::fit::spec::MAX_MESHES;
 use crate::job::JobKind;
 use crate::shrink::lattice::LatticeSpec;
 use crate::shrink::{Component, Density, Distortion, Effort, Method, OnTopology, ShrinkSpec};
+use serde::Deserialize as _;
 use serde_json::{Map, Value};
 use std::collections::BTreeMap;
 
@@ -83,22 +88,108 @@ impl Faults {
 
 /// Reads a whole request; it means nothing when faults were found.
 pub fn read_spec(value: &Value, faults: &mut Faults) -> JobSpec {
-    let mut spec = JobSpec {
-        kind: JobKind::Shrink,
+    let mut kind = JobKind::default();
+    if let Some(name) = value.get("kind").and_then(|kind| faults.string(kind, "/kind")) {
+        match JobKind::from_name(name) {
+            Some(named) => kind = named,
+            None => {
+                let known = JobKind::ALL.map(JobKind::name).join(", ");
+                faults.add("/kind", "unknown_value", format!("unknown kind {name:?}; known: {known}"));
+            }
+        }
+    }
+    let (work, outputs) = match kind {
+        JobKind::Shrink => (
+            Work::Shrink(Box::new(read_shrinking(value, faults))),
+            vec![OutputName::Glb, OutputName::Preview, OutputName::Report],
+        ),
+        JobKind::Fit => (Work::Fit(read_fitting(value, faults)), vec![OutputName::Network, OutputName::Report]),
+    };
+    let mut spec = JobSpec { work, outputs, labels: BTreeMap::new() };
+    if let Some(outputs) = value.get("outputs") {
+        spec.outputs = read_outputs(outputs, kind, faults);
+    }
+    if let Some(labels) = value.get("labels") {
+        spec.labels = read_labels(labels, faults);
+    }
+    spec
+}
+
+/// Reads what a fit is of.
+fn read_fitting(value: &Value, faults: &mut Faults) -> Fitting {
+    let mut fitting = Fitting { meshes: Vec::new(), fit: FitSpec::default() };
+    let Some(object) = faults.object(value, "", &["kind", "meshes", "fit", "outputs", "labels"]) else {
+        return fitting;
+    };
+    match object.get("meshes") {
+        None => faults.add("/meshes", "missing_member", "a fit needs meshes, the names of uploaded inputs"),
+        Some(Value::Array(list)) if list.is_empty() => faults.add("/meshes", "too_few", "a fit needs a mesh"),
+        Some(Value::Array(list)) if list.len() > MAX_MESHES => {
+            faults.add("/meshes", "too_many", format!("{} meshes, and at most {MAX_MESHES} are fitted", list.len()));
+        }
+        Some(Value::Array(list)) => {
+            for (i, name) in list.iter().enumerate() {
+                fitting.meshes.extend(read_input(name, &format!("/meshes/{i}"), faults));
+            }
+        }
+        Some(other) => {
+            faults.add("/meshes", "wrong_type", format!("expected a list of inputs, found {}", type_name(other)));
+        }
+    }
+    let Some(given) = object.get("fit").and_then(|fit| faults.object(fit, "/fit", &FIT_MEMBERS)) else {
+        return fitting;
+    };
+    // read one by one, so that each fault has its place
+    let mut sound = Map::new();
+    for (name, value) in given.iter().filter(|(name, _)| FIT_MEMBERS.contains(&name.as_str())) {
+        let alone = Value::Object(Map::from_iter([(name.clone(), value.clone())]));
+        match FitSpec::deserialize(&alone) {
+            Ok(_) => drop(sound.insert(name.clone(), value.clone())),
+            Err(error) => faults.add(format!("/fit/{name}"), "invalid_value", error.to_string()),
+        }
+    }
+    fitting.fit = FitSpec::deserialize(&Value::Object(sound)).unwrap_or_default();
+    let wrong = fitting.fit.faults().into_iter();
+    faults.0.extend(wrong.map(|fault| Fault { pointer: format!("/fit{}", fault.pointer), ..fault }));
+    fitting
+}
+
+/// Members of `fit`.
+const FIT_MEMBERS: [&str; 13] = [
+    "layers",
+    "width",
+    "activation",
+    "latent_size",
+    "epochs",
+    "samples",
+    "sampling",
+    "batch",
+    "learning_rate",
+    "normal",
+    "eikonal",
+    "latent_penalty",
+    "seed",
+];
+
+/// The name of an input.
+fn read_input(value: &Value, pointer: &str, faults: &mut Faults) -> Option<BlobId> {
+    let id = faults.string(value, pointer)?.parse().ok();
+    if id.is_none() {
+        faults.add(pointer, "invalid_id", "expected sha256: and 64 lower-case hexadecimal digits");
+    }
+    id
+}
+
+/// Reads what is shrunk, and how.
+fn read_shrinking(value: &Value, faults: &mut Faults) -> Shrinking {
+    let mut spec = Shrinking {
         field: FieldSpec::default(),
         weight: None,
         shrink: ShrinkSpec::default(),
         budget: Budget::default(),
-        outputs: vec![OutputName::Glb, OutputName::Preview, OutputName::Report],
-        labels: BTreeMap::new(),
     };
     let known = ["kind", "field", "weight", "shrink", "budget", "outputs", "labels"];
     let Some(object) = faults.object(value, "", &known) else { return spec };
-    if let Some(kind) = object.get("kind").and_then(|kind| faults.string(kind, "/kind"))
-        && kind != "shrink"
-    {
-        faults.add("/kind", "unknown_value", format!("unknown kind {kind:?}; known: shrink"));
-    }
     match object.get("field") {
         Some(field) => spec.field = read_field(field, "/field", faults),
         None => faults.add("/field", "missing_member", "a job needs a field"),
@@ -121,12 +212,6 @@ pub fn read_spec(value: &Value, faults: &mut Faults) -> JobSpec {
     }
     if let Some(budget) = object.get("budget") {
         spec.budget = read_budget(budget, faults);
-    }
-    if let Some(outputs) = object.get("outputs") {
-        spec.outputs = read_outputs(outputs, faults);
-    }
-    if let Some(labels) = object.get("labels") {
-        spec.labels = read_labels(labels, faults);
     }
     spec
 }
@@ -153,15 +238,7 @@ fn read_field(value: &Value, pointer: &str, faults: &mut Faults) -> FieldSpec {
     let Some(object) = faults.object(value, pointer, &known) else { return field };
     match (object.get("scene"), object.get("input")) {
         (Some(scene), None) => field.scene = Some(scene.clone()),
-        (None, Some(input)) => {
-            if let Some(name) = faults.string(input, &format!("{pointer}/input")) {
-                field.input = name.parse().ok();
-                if field.input.is_none() {
-                    let detail = "expected sha256: and 64 lower-case hexadecimal digits";
-                    faults.add(format!("{pointer}/input"), "invalid_id", detail);
-                }
-            }
-        }
+        (None, Some(input)) => field.input = read_input(input, &format!("{pointer}/input"), faults),
         (Some(_), Some(_)) => faults.add(pointer, "ambiguous", "give scene or input, not both"),
         (None, None) => faults.add(pointer, "missing_member", "give scene or input"),
     }
@@ -342,7 +419,7 @@ fn read_lattice(value: &Value, faults: &mut Faults) -> Option<LatticeSpec> {
     }
 }
 
-fn read_outputs(value: &Value, faults: &mut Faults) -> Vec<OutputName> {
+fn read_outputs(value: &Value, kind: JobKind, faults: &mut Faults) -> Vec<OutputName> {
     let Some(list) = value.as_array() else {
         faults.add("/outputs", "wrong_type", format!("expected a list of names, found {}", type_name(value)));
         return Vec::new();
@@ -358,10 +435,12 @@ fn read_outputs(value: &Value, faults: &mut Faults) -> Vec<OutputName> {
             Some(output) if outputs.contains(&output) => {
                 faults.add(pointer, "duplicate", format!("{name:?} is named twice"));
             }
-            Some(output) => outputs.push(output),
-            None => {
-                let known = OutputName::ALL.map(OutputName::name).join(", ");
-                faults.add(pointer, "unknown_value", format!("unknown output {name:?}; known: {known}"));
+            Some(output) if OutputName::of(kind).contains(&output) => outputs.push(output),
+            _ => {
+                let known: Vec<&str> = OutputName::of(kind).iter().map(|output| output.name()).collect();
+                let (kind, known) = (kind.name(), known.join(", "));
+                let detail = format!("a job of the kind {kind} makes no output {name:?}; it makes: {known}");
+                faults.add(pointer, "unknown_value", detail);
             }
         }
     }

@@ -4,6 +4,13 @@ use super::*;
 use crate::shrink::Density;
 use serde_json::json;
 
+fn shrinking(spec: &JobSpec) -> &Shrinking {
+    match &spec.work {
+        Work::Shrink(work) => work,
+        other => panic!("{other:?}"),
+    }
+}
+
 fn faults(value: Value) -> Vec<(String, &'static str)> {
     JobSpec::from_value(&value).expect_err("faulty").into_iter().map(|f| (f.pointer, f.code)).collect()
 }
@@ -11,7 +18,7 @@ fn faults(value: Value) -> Vec<(String, &'static str)> {
 #[test]
 fn a_field_alone_is_a_good_job() {
     let spec = JobSpec::from_value(&json!({"field": {"scene": {"sphere": {"radius": 0.5}}}})).expect("good");
-    assert_eq!(spec.shrink, ShrinkSpec::default());
+    assert_eq!(shrinking(&spec).shrink, ShrinkSpec::default());
     assert_eq!(spec.outputs, [OutputName::Glb, OutputName::Preview, OutputName::Report]);
 }
 
@@ -34,7 +41,8 @@ fn a_stored_request_is_read_back_as_it_was() {
     let stored = serde_json::to_value(&spec).expect("serializes");
     assert_eq!(stored["shrink"]["component"], "largest");
     let shrink = serde_json::from_value(stored["shrink"].clone()).expect("reads");
-    assert_eq!((spec.shrink, spec.budget), (shrink, Budget::default()), "the record's own reader agrees");
+    let work = shrinking(&spec);
+    assert_eq!((work.shrink.clone(), work.budget), (shrink, Budget::default()), "the record's own reader agrees");
 }
 
 #[test]
@@ -95,7 +103,7 @@ fn every_fault_is_found_at_once_and_named_by_its_place() {
 fn a_weight_is_read_like_a_field_and_makes_the_density() {
     let weight = json!({"input": format!("sha256:{}", "ab".repeat(32)), "level": 0.5});
     let spec = JobSpec::from_value(&json!({"field": {"scene": {}}, "weight": weight})).expect("good");
-    assert_eq!(spec.shrink.density, Density::Weight);
+    assert_eq!(shrinking(&spec).shrink.density, Density::Weight);
     let stored = serde_json::to_value(&spec).expect("serializes");
     assert_eq!((&stored["weight"]["level"], JobSpec::from_value(&stored)), (&json!(0.5), Ok(spec)));
     let other = json!({"field": {"scene": {}}, "weight": weight, "shrink": {"density": "area"}});
@@ -142,4 +150,44 @@ fn what_only_curves_have_is_refused_for_surfaces_by_its_place() {
 fn a_number_too_large_for_an_index_is_refused_and_not_wrapped() {
     let value = json!({"field": {"scene": {}}, "shrink": {"lattice": {"octahedral": {"n": 4_294_967_298u64}}}});
     assert_eq!(faults(value), [("/shrink/lattice/octahedral/n".to_owned(), "wrong_type")]);
+}
+
+#[test]
+fn a_fit_is_read_with_its_meshes_and_read_back_as_it_was() {
+    let name = |digit: &str| format!("sha256:{}", digit.repeat(64));
+    let alone = JobSpec::from_value(&json!({"kind": "fit", "meshes": [name("a")]})).expect("good");
+    assert_eq!(alone.outputs, [OutputName::Network, OutputName::Report]);
+    let fit =
+        json!({"layers": 3, "activation": {"sine": {"w0": 20}}, "learning_rate": 5e-4, "sampling": "grid", "seed": 9});
+    let value = json!({"kind": "fit", "meshes": [name("a"), name("b")], "fit": fit, "outputs": ["network"]});
+    let spec = JobSpec::from_value(&value).expect("good");
+    let Work::Fit(fitting) = &spec.work else { panic!("{spec:?}") };
+    assert_eq!((fitting.meshes.len(), fitting.fit.layers, fitting.fit.seed), (2, 3, 9));
+    assert_eq!(fitting.fit.learning_rate, 5e-4);
+    assert_eq!(JobSpec::from_value(&serde_json::to_value(&spec).expect("serializes")), Ok(spec));
+}
+
+#[test]
+fn the_faults_of_a_fit_have_their_places() {
+    let found = faults(json!({
+        "kind": "fit", "field": {"scene": {}}, "meshes": ["sha256:1", 3],
+        "fit": {"layers": "four", "epochs": 0, "normal": -1, "momentum": 0.9, "activation": "swish"},
+        "outputs": ["glb"],
+    }));
+    let expected = [
+        ("/field", "unknown_member"),
+        ("/meshes/0", "invalid_id"),
+        ("/meshes/1", "wrong_type"),
+        ("/fit/momentum", "unknown_member"),
+        ("/fit/activation", "invalid_value"),
+        ("/fit/layers", "invalid_value"),
+        ("/fit/epochs", "out_of_range"),
+        ("/fit/normal", "out_of_range"),
+        ("/outputs/0", "unknown_value"),
+    ];
+    assert_eq!(found, expected.map(|(p, c)| (p.to_owned(), c)));
+    assert_eq!(faults(json!({"kind": "fit"})), [("/meshes".to_owned(), "missing_member")]);
+    assert_eq!(faults(json!({"kind": "fit", "meshes": []})), [("/meshes".to_owned(), "too_few")]);
+    let kind = json!({"kind": "melt", "field": {"scene": {}}});
+    assert_eq!(faults(kind), [("/kind".to_owned(), "unknown_value")]);
 }
