@@ -11,6 +11,7 @@ pub mod fit;
 pub mod healthcheck;
 mod interrupt;
 mod options;
+pub mod sensitivity;
 pub mod serve;
 
 use crate::field::Domain;
@@ -57,6 +58,9 @@ enum Command {
     /// Fit a network to meshes: one gives a SIREN, several an auto-decoder with a latent code each
     #[command(after_long_help = fit::EXAMPLES)]
     Fit(fit::FitArgs),
+    /// Carry a gradient of a surface's vertices back to the latent code and the weights of its network
+    #[command(after_long_help = sensitivity::EXAMPLES)]
+    Sensitivity(sensitivity::SensitivityArgs),
     /// Print the description of the service (OpenAPI 3.1, YAML)
     Openapi,
     /// Ask a service whether it is ready: exits 0 when it is
@@ -302,6 +306,7 @@ pub fn run() -> ExitCode {
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Compare(args) => compare::run(&args),
         Command::Fit(args) => fit::run(&args),
+        Command::Sensitivity(args) => sensitivity::run(&args),
         Command::Openapi => openapi(),
         Command::Healthcheck { url } => healthcheck::run(&url),
     }

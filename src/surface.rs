@@ -7,6 +7,7 @@ pub mod gltf;
 pub mod lettering;
 pub mod preview;
 pub mod raster;
+pub mod sensitivity;
 pub mod sheet;
 pub mod tensors;
 

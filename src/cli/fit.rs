@@ -207,7 +207,12 @@ fn fitted(args: &FitArgs) -> Result<(), (u8, String)> {
     for (path, shape) in args.meshes.iter().zip(&made.report.shapes) {
         let zeros = shape.closeness.map_or("no zero level set".to_owned(), |closeness| {
             let distance = closeness.distance;
-            format!("zero level set mean {:.3} %, max {:.2} %", 100.0 * distance.mean, 100.0 * distance.max)
+            let (mean, max) = (100.0 * distance.mean, 100.0 * distance.max);
+            let parts = match shape.components {
+                1 => String::new(),
+                n => format!(" in {n} components"),
+            };
+            format!("zero level set{parts} mean {mean:.3} %, max {max:.2} %")
         });
         println!("{}: error {:.3} %, {zeros}", path.display(), 100.0 * shape.error);
     }

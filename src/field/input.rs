@@ -14,9 +14,10 @@ pub use sniff::Format;
 use super::grid::Grid;
 use super::mesh::{MeshField, Soundness, TriangleMesh};
 use super::network::family::Detected;
-use super::network::{Activation, Network};
+use super::network::{Activation, Network, NetworkField};
 use super::scene::Scene;
 use super::{Domain, Field, FieldError, Metric};
+use glam::DVec3;
 use options::refuse;
 use wrap::{Boxed, Leveled, Scaled, Transformed};
 
@@ -120,18 +121,8 @@ pub fn open(bytes: &[u8], options: &FieldOptions) -> Result<Opened, FieldError> 
             Ok(finish(field, options, on_scene.is_some()).into())
         }
         Format::Safetensors | Format::Npz | Format::Torch | Format::Folder | Format::Onnx => {
-            refuse(std::mem::take(&mut faults))?;
-            let (mut network, detected) = network::read(bytes, format, options)?;
-            let latent = options.latent_of(&network, &mut faults);
-            if options.domain == Some(DomainOption::Named(DomainName::Fit)) {
-                faults.push(options::fault("/domain", "not_offered", "a network's domain cannot be fitted"));
-            }
-            network::overridden(&mut network, options, &mut faults);
-            refuse(faults)?;
-            let field = network
-                .field(&latent)
-                .ok_or_else(|| FieldError::Unsupported { detail: "a latent code that is not finite".to_owned() })?;
-            Ok(Opened { field: finish(Box::new(field), options, false), detected: Some(detected) })
+            let (placed, detected) = open_network(bytes, options)?;
+            Ok(Opened { field: finish(Box::new(placed.field()), options, false), detected: Some(detected) })
         }
         Format::Mesh(_) => {
             faults.extend(options.refuse_network_members("a mesh"));
@@ -159,6 +150,63 @@ pub fn open(bytes: &[u8], options: &FieldOptions) -> Result<Opened, FieldError> 
             Ok(finish(Box::new(Grid::read(bytes, domain)?), options, true).into())
         }
     }
+}
+
+/// A network with the latent code and the place in the scene that options give it.
+pub struct Placed {
+    /// The network, in a frame of its own.
+    pub network: Network,
+    /// Its latent code, of its latent size; empty for a network without.
+    pub latent: Vec<f32>,
+    transform: Transform,
+}
+
+impl Placed {
+    /// The network's field in its own frame.
+    pub fn field(&self) -> NetworkField {
+        self.network.field(&self.latent).unwrap_or_else(|| unreachable!("the code was checked when it was read"))
+    }
+
+    /// A place of the scene in the network's frame.
+    pub fn from_scene(&self, p: DVec3) -> DVec3 {
+        self.transform.rotation().transpose() * (p - DVec3::from(self.transform.translate)) / self.transform.scale
+    }
+
+    /// The derivative by a place in the network's frame of what has this derivative by the place in the scene.
+    pub fn pulled_back(&self, gradient: DVec3) -> DVec3 {
+        self.transform.scale * (self.transform.rotation().transpose() * gradient)
+    }
+
+    /// How far something in the scene moves when it moves by 1 in the network's frame.
+    pub fn scale(&self) -> f64 {
+        self.transform.scale
+    }
+}
+
+/// Reads a network from the bytes of any known format of networks, with `options` applied but for those of values (sign, scale, level
+/// and domain). Says what the file was taken for.
+///
+/// # Errors
+/// [`FieldError::Unsupported`] for a field of another kind, otherwise as [`open`].
+pub fn open_network(bytes: &[u8], options: &FieldOptions) -> Result<(Placed, Detected), FieldError> {
+    let format = Format::detect(bytes)?;
+    if !format.is_network() {
+        let detail = format!("only a network has weights and codes, and this is {}", format.name());
+        return Err(FieldError::Unsupported { detail });
+    }
+    let mut faults = options.faults();
+    refuse(std::mem::take(&mut faults))?;
+    let (mut network, detected) = network::read(bytes, format, options)?;
+    let latent = options.latent_of(&network, &mut faults);
+    if options.domain == Some(DomainOption::Named(DomainName::Fit)) {
+        faults.push(options::fault("/domain", "not_offered", "a network's domain cannot be fitted"));
+    }
+    network::overridden(&mut network, options, &mut faults);
+    refuse(faults)?;
+    if latent.iter().any(|z| !z.is_finite()) {
+        return Err(FieldError::Unsupported { detail: "a latent code that is not finite".to_owned() });
+    }
+    Ok((Placed { network, latent, transform: options.transform.unwrap_or_default() }, detected))
 }
 
 /// Reads a mesh from the bytes of any known format of meshes.

@@ -6,6 +6,7 @@ use crate::field::mesh::MeshField;
 use crate::field::network::Network;
 use crate::field::sampler::Tally;
 use crate::field::{Field, Sampler};
+use crate::measure::certificate::topology;
 use crate::measure::distance::{Mesh, SAMPLES, between};
 use crate::measure::marching_cubes::marching_cubes;
 use crate::measure::report::Closeness;
@@ -43,6 +44,8 @@ pub struct ShapeReport {
     /// Distances between the zero level set (by marching cubes on a grid of 128 x 128 x 128) and the mesh, both ways, in parts of
     /// the diagonal, and how the normals agree. Nothing when the network has no zero level set.
     pub closeness: Option<Closeness>,
+    /// Components of that zero level set: more than the mesh has are specks that the network imagines.
+    pub components: u64,
 }
 
 /// Measures a network in scene units against its meshes.
@@ -90,8 +93,9 @@ fn shape(
     let diagonal = (DVec3::from(most) - DVec3::from(least)).length();
     let error = found.iter().zip(&truth).map(|(f, d)| (f - d).abs()).sum::<f64>() / points.len() as f64 / diagonal;
     let zeros = marching_cubes(&sampler, low, high, SIDE)?;
+    let components = topology(zeros.vertices.len(), &zeros.triangles).components;
     let zeros = Mesh { vertices: &zeros.vertices, triangles: &zeros.triangles };
     let truth = Mesh { vertices: &vertices, triangles: &mesh.mesh().triangles };
     let closeness = between(zeros, truth, SAMPLES, &settings)?.map(|comparison| comparison.closeness);
-    Ok(ShapeReport { error, closeness })
+    Ok(ShapeReport { error, closeness, components })
 }

@@ -2,9 +2,11 @@
 
 mod fitting;
 mod plane;
+mod sensing;
 
 pub use fitting::{Kept, open_mesh, run_fit};
 pub use plane::{CurveMade, make_curve};
+pub use sensing::{Carried, SensitivityReport, sensitivity_of};
 
 use super::failure::{Ended, Failure};
 use super::spec::{FieldSpec, OutputName};

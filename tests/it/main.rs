@@ -14,5 +14,6 @@ mod losses;
 mod metrics;
 mod refusals;
 mod relaxed;
+mod sensitivity;
 mod walk;
 mod weight;

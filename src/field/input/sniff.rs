@@ -27,6 +27,11 @@ pub enum Format {
 }
 
 impl Format {
+    /// Whether files of this format hold networks.
+    pub fn is_network(self) -> bool {
+        matches!(self, Self::Safetensors | Self::Npz | Self::Torch | Self::Folder | Self::Onnx)
+    }
+
     /// The format of the bytes.
     ///
     /// # Errors

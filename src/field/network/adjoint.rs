@@ -6,7 +6,7 @@
 
 use super::Network;
 use super::passes::{Biases, Packed, TILES, decode, encode, encode_along, place};
-use super::product::{TILE, outer, outer_place, outer_scratch, outer_size, padded};
+use super::product::{Panels, Start, TILE, multiply, outer, outer_place, outer_scratch, outer_size, padded};
 use crate::field::Points;
 use std::ops::Range;
 
@@ -155,6 +155,49 @@ impl<'n> Prepared<'n> {
             self.block(&biases, points, these, gradients, sums, &mut scratch, &mut loss);
         }
         sums.scratch = scratch;
+    }
+
+    /// Writes the derivatives of the value at every point by the entries of the latent code `code`, row after row of its size.
+    pub fn by_code(&self, code: &[f32], points: Points<'_>, rows: &mut [f32]) {
+        let (packed, encoding) = (&self.packed, self.packed.encoding());
+        let biases = Packed::fold(self.network, code);
+        let mut previous = 0;
+        let to_code = self.network.layers.iter().enumerate().map(|(i, layer)| {
+            let (first, inputs) = (previous, layer.inputs());
+            let scale = layer.skip.map_or(1.0, |s| s.scale);
+            previous = layer.outputs();
+            let columns = if self.network.sees_input(i) { layer.outputs() } else { 0 };
+            Panels::new(code.len(), columns, |z, row| scale * layer.weights[row * inputs + first + z])
+        });
+        let to_code: Vec<Panels> = to_code.collect();
+        let of_code = TILE * padded(code.len());
+        let mut scratch = vec![0.0; TILE * (packed.point() + 2 * packed.units() + 2 * packed.widest()) + of_code];
+        let (encoded, rest) = scratch.split_at_mut(TILE * packed.point());
+        let (outputs, rest) = rest.split_at_mut(TILE * packed.units());
+        let (slopes, rest) = rest.split_at_mut(TILE * packed.units());
+        let (here, rest) = rest.split_at_mut(TILE * packed.widest());
+        let (before, by_code) = rest.split_at_mut(TILE * packed.widest());
+        for start in (0..points.len()).step_by(TILE) {
+            let these = start..(start + TILE).min(points.len());
+            place(points, these.clone(), encoded);
+            encode(encoding, encoded);
+            packed.forward(&biases, 1, encoded, outputs, Some(&mut *slopes));
+            let last = TILE * padded(1);
+            here[..last].copy_from_slice(&slopes[slopes.len() - last..]);
+            by_code.fill(0.0);
+            let finish = |at: usize, piece: &mut [f32]| {
+                piece.iter_mut().zip(&slopes[at..]).for_each(|(g, slope)| *g *= slope);
+            };
+            packed.backward(1, None, here, before, finish, |i, adjoint| {
+                if !to_code[i].is_empty() {
+                    multiply(&[(&to_code[i], adjoint)], 1, Start::There, by_code, |_, _| {});
+                }
+            });
+            let rows = &mut rows[these.start * code.len()..these.end * code.len()];
+            for (lane, row) in rows.chunks_exact_mut(code.len()).enumerate() {
+                row.iter_mut().zip(by_code.chunks_exact(TILE)).for_each(|(to, from)| *to = from[lane]);
+            }
+        }
     }
 
     #[expect(clippy::too_many_arguments, reason = "the inner half of `sum`")]
