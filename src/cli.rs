@@ -3,6 +3,7 @@
 //! Exit codes: 0 done; 1 failed, or made a result that did not pass its own checks; 2 bad usage; 3 bad input; 4 the shape
 //! could not be wrapped.
 
+pub mod animate;
 pub mod compare;
 pub mod evaluate;
 pub mod extract;
@@ -49,6 +50,9 @@ enum Command {
     /// Wrap one field: exits 0 when the result passed every check (closed, Euler characteristic 2, one chart, no flips, no
     /// self-intersections, nowhere farther than 1 % of the diagonal from the zero level set)
     Extract(ExtractArgs),
+    /// Wrap a network along a path through its latent space: one GLB with a morph target for every frame and one set of UVs
+    #[command(after_long_help = ANIMATE_EXAMPLES)]
+    Animate(AnimateArgs),
     /// Measure a GLB or any mesh against a mesh or a field, beside marching cubes on the same field
     #[command(after_long_help = EVALUATE_EXAMPLES)]
     Evaluate(EvaluateArgs),
@@ -104,6 +108,9 @@ pub struct ExtractArgs {
     /// A field whose values say how closely samples are spaced where: in proportion, instead of --density
     #[arg(long, value_name = "FIELD", conflicts_with = "density")]
     pub weight: Option<PathBuf>,
+    /// A surface that --surface wrote of a field nearby, on the same lattice: begin from it, and keep its UVs
+    #[arg(long, value_name = "S.safetensors")]
+    pub warm_start: Option<PathBuf>,
     /// How it is wrapped.
     #[command(flatten)]
     pub shrink: ShrinkArgs,
@@ -125,6 +132,63 @@ pub struct ExtractArgs {
     /// Threads; 0 is one per core. The result does not depend on it
     #[arg(long, default_value_t = 0)]
     pub threads: usize,
+}
+
+/// What `animate --help` ends with.
+const ANIMATE_EXAMPLES: &str = "\
+The file of latent codes is JSON: a list with an entry for every frame, or the two ends of a straight way. An entry is
+a latent code, or the row of one that comes with the network:
+  [[0, 0], [0.1, 0.05], 3]
+  {\"from\": 0, \"to\": [1, -1], \"frames\": 24}
+
+Examples:
+  shrinkd animate morph.safetensors --latents way.json -o way.glb --report way.report.json
+  shrinkd animate morph.safetensors --latents way.json --cold --report cold.json
+
+Exits 0 when every frame passed every check, 1 when one did not (the GLB is written, and the frame named), 2 on bad
+usage, 3 when the network or the file of latent codes cannot be read, 4 when a frame's shape cannot be wrapped.";
+
+/// Arguments of `animate`.
+#[derive(Debug, Args)]
+pub struct AnimateArgs {
+    /// The network: of any kind that takes a latent code, told by its content
+    pub net: PathBuf,
+    /// The latent codes of the frames (JSON)
+    #[arg(long, value_name = "FILE.json")]
+    pub latents: PathBuf,
+    /// Where the GLB goes
+    #[arg(short, long, value_name = "OUT.glb", required_unless_present = "cold")]
+    pub output: Option<PathBuf>,
+    /// Where the sphere is sampled: latlong:N_THETAxN_PHI or octahedral:N
+    #[arg(long, value_parser = parse_lattice, default_value = "latlong:200x100")]
+    pub lattice: LatticeSpec,
+    /// How the first frame is wrapped, and those that cannot be made from the one before.
+    #[command(flatten)]
+    pub shrink: ShrinkArgs,
+    /// Box that holds the zero level sets of all frames: X0,Y0,Z0,X1,Y1,Z1
+    #[arg(long, value_name = "BOX", value_parser = parse_domain, allow_hyphen_values = true)]
+    pub domain: Option<DomainOption>,
+    /// What the file does not say, as the members of a job's field: '{"w0": 25, "sign": "positive_inside"}'
+    #[arg(long, value_name = "JSON", value_parser = parse_field_options)]
+    pub field_options: Option<Box<FieldOptions>>,
+    /// Where the report goes (JSON): evaluations, distances, flips and drift of every frame
+    #[arg(long, value_name = "R.json")]
+    pub report: Option<PathBuf>,
+    /// Frames per second
+    #[arg(long, default_value_t = 12.0, value_parser = parse_fps)]
+    pub fps: f32,
+    /// Make every frame from nothing and write no GLB, to see what warm starts save and how far UVs drift without them
+    #[arg(long, conflicts_with = "output")]
+    pub cold: bool,
+    /// Threads; 0 is one per core. The result does not depend on it
+    #[arg(long, default_value_t = 0)]
+    pub threads: usize,
+}
+
+/// Frames per second: more than none, at most a thousand.
+fn parse_fps(text: &str) -> Result<f32, String> {
+    let fps: Option<f32> = text.parse().ok();
+    fps.filter(|fps| (0.01..=1000.0).contains(fps)).ok_or_else(|| "expected a number from 0.01 to 1000".to_owned())
 }
 
 /// What a file with a field in it leaves open.
@@ -303,6 +367,7 @@ pub fn run() -> ExitCode {
     match Cli::parse().command {
         Command::Serve(args) => serve::run(&args),
         Command::Extract(args) => extract::run(&args),
+        Command::Animate(args) => animate::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Compare(args) => compare::run(&args),
         Command::Fit(args) => fit::run(&args),

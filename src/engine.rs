@@ -78,7 +78,8 @@ pub struct Page {
 /// What became of a wish to forget a job.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Forgotten {
-    /// It is gone; these output hashes (hexadecimal SHA-256) are named by no job any more.
+    /// It is gone; these hashes (hexadecimal SHA-256) of its outputs, and of the surface that it began from, are named by no
+    /// job any more.
     Gone(Vec<String>),
     /// It has not ended.
     Running,
@@ -179,8 +180,12 @@ pub enum EngineError {
 pub trait Engine: Send + Sync {
     /// Accepts a job.
     async fn submit(&self, job: NewJob) -> Result<Submitted, EngineError>;
+    /// What a submit with this key would be answered without accepting anything; `None` when the key is new.
+    async fn recall(&self, key: IdempotencyKey) -> Result<Option<Submitted>, EngineError>;
     /// The record of a job.
     async fn get(&self, id: JobId) -> Result<Option<Job>, EngineError>;
+    /// The request of a job.
+    async fn spec(&self, id: JobId) -> Result<Option<JobSpec>, EngineError>;
     /// A page of records.
     async fn list(&self, query: ListQuery) -> Result<Page, EngineError>;
     /// Asks for a job to be stopped: a queued one ends at once, a running one is told. The record afterwards.

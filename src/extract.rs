@@ -4,13 +4,21 @@
 //! Guarantees: the first attempt that passes is the result; when none does, the best one is, with a verdict that says what is
 //! wrong and where. Only its chart is relaxed, where that is asked for. Every evaluation of every attempt is counted into the sampler's tally; those of measuring are not. Like
 //! the rooms it stands on, it knows no clock: a caller who has one is told when a [`Part`] begins.
+//!
+//! A warm start, where one is given, comes before the attempts: what it makes has to pass the same certificate, or the attempts
+//! follow as if it had not been tried.
+
+pub mod path;
 
 use crate::field::sampler::Tally;
 use crate::field::{Field, Sampler};
-use crate::measure::report::{Evaluations, Report, measure};
+use crate::measure::moved::moved;
+use crate::measure::report::{Evaluations, Report, WarmStart, measure};
 use crate::settings::{Canceled, Progress, Settings};
+use crate::shrink::lattice::SphereLattice;
 use crate::shrink::study::{DEEPEST, Study, Topology, study};
-use crate::shrink::{Effort, Method, OnTopology, ShrinkError, ShrinkSpec, mend, shrink};
+use crate::shrink::warm::{Earlier, warm};
+use crate::shrink::{Effort, Method, OnTopology, ShrinkError, ShrinkSpec, Wrap, mend, shrink};
 use crate::surface::Surface;
 use glam::{DVec3, Vec3};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -65,8 +73,9 @@ pub struct Extracted {
     pub refusal: Option<ShrinkError>,
 }
 
-/// Where the share of every attempt in the progress ends. The first one mostly is the last.
-const ENDS: [f32; 1 + Effort::ATTEMPTS as usize] = [0.0, 0.85, 0.93, 1.0];
+/// Where the share of every attempt in the progress ends, a warm start being the first where there is one. The first one
+/// mostly is the last.
+const ENDS: [f32; 2 + Effort::ATTEMPTS as usize] = [0.0, 0.85, 0.93, 0.97, 1.0];
 /// Where relaxing the chart of the surface that was chosen starts.
 const RELAXING: f32 = 0.95;
 /// Repairs of one attempt's surface, each followed by a measurement, ...
@@ -80,18 +89,25 @@ const VAIN: u32 = 4;
 /// Share of an attempt's time that shrinking takes; measuring takes the rest.
 const SHRINKING: f32 = 0.8;
 
-/// Makes a certified surface of the sampler's field, or the best there is. `weight` is what [`shrink`] takes.
+/// Makes a certified surface of the sampler's field, or the best there is. `weight` is what [`shrink`] takes. From an
+/// `earlier` surface on the lattice of the spec a warm start is made first, and is the result if it passes; it is not among the
+/// attempts of the budget.
 ///
 /// # Errors
 /// [`ShrinkError`] when the token was raised, or when no attempt gave a surface.
+///
+/// # Panics
+/// When the earlier surface is on another lattice.
 pub fn extract(
     sampler: &Sampler<'_>,
     spec: &ShrinkSpec,
     weight: Option<&dyn Field>,
     budget: Budget,
+    earlier: Option<&Earlier>,
     begins: &dyn Fn(Part),
 ) -> Result<Extracted, ShrinkError> {
     let told = Told { settings: *sampler.settings(), fraction: AtomicU32::new(0) };
+    let run = Run { sampler, spec, told: &told, begins };
     let (mut depth, mut mended) = (0, None);
     begins(Part::Shrink);
     if spec.method == Method::Adaptive {
@@ -102,12 +118,22 @@ pub fn extract(
     let (mut effort, mut costliest, mut made) = (Effort::default(), 0, 0);
     let mut best: Option<(Surface, Report)> = None;
     let (mut refusal, mut nothing) = (None, ShrinkError::Unmapped);
-    for attempt in 0..budget.attempts(spec.method) {
+    let mut cooled = None;
+    if let Some(earlier) = earlier {
+        made = 1;
+        match run.warm(earlier, mended.as_ref())? {
+            Ok(passed) => best = Some(passed),
+            Err(reason) => cooled = Some(reason),
+        }
+    }
+    let warmed = best.is_some();
+    let attempts = if warmed { 0 } else { budget.attempts(spec.method) };
+    for attempt in 0..attempts {
         let before = spent();
         if attempt > 0 && !budget.allows(before, costliest) {
             break;
         }
-        if attempt > 0 {
+        if made > 0 {
             begins(Part::Shrink);
         }
         // what went wrong may be a handle or a gap narrower than the first look's lattice
@@ -115,10 +141,9 @@ pub fn extract(
             depth += 1;
             mended = study(sampler, spec, depth)?;
         }
-        (effort.attempt, made) = (attempt, attempt + 1);
-        let (start, end) = (ENDS[attempt as usize], ENDS[attempt as usize + 1]);
-        let measured_from = start + SHRINKING * (end - start);
-        let progress = |progress: Progress| told.tell(attempt, start, measured_from, progress);
+        let turn = Turn { index: made };
+        (effort.attempt, made) = (attempt, made + 1);
+        let progress = |progress: Progress| turn.shrinking(&told, progress);
         let settings = Settings { progress: &progress, ..told.settings };
         let field = field_of(sampler, mended.as_ref());
         let wrap = match shrink(&Sampler::new(field, settings, sampler.tally()), spec, weight, &effort) {
@@ -143,35 +168,7 @@ pub fn extract(
                 break;
             }
         };
-        let mut wrap = wrap;
-        // what the certificate finds folded or crossing is first repaired where it is
-        let (mut least, mut vain) = (u64::MAX, 0);
-        for repair in 0.. {
-            begins(Part::Measure);
-            told.tell(attempt, measured_from, end, Progress { stage: "measure", ..Progress::default() });
-            let quiet = Sampler::new(field, told.settings, sampler.tally());
-            let surface = Surface::new(wrap.clone());
-            let mut report = measure(&surface, &quiet, &sampler.tally().by_stage(), spec)?;
-            if let Some(study) = &mended {
-                let invented_area = invented(&surface, study, sampler)?;
-                report.topology = Some(Topology { invented_area, ..study.topology.clone() });
-            }
-            let (passed, places) = (report.verdict.passed, report.verdict.places());
-            let local = report.flips.surface + report.self_intersections;
-            vain = if local < least { 0 } else { vain + 1 };
-            least = least.min(local);
-            // of equals the later one: it was made with more effort
-            if passed || best.as_ref().is_none_or(|(_, other)| rank(&report) <= rank(other)) {
-                best = Some((surface, report));
-            }
-            let enough = repair >= REPAIRS && (local > FEW || repair == MOST_REPAIRS || vain == VAIN);
-            if passed || local == 0 || enough || spec.method == Method::Paper {
-                effort.places.extend(places);
-                break;
-            }
-            begins(Part::Shrink);
-            mend(&quiet, &mut wrap, &places, 1 + repair)?;
-        }
+        effort.places.extend(run.certified(wrap, mended.as_ref(), turn, &mut best)?);
         costliest = costliest.max(spent() - before);
         if best.as_ref().is_some_and(|(_, report)| report.verdict.passed) {
             break;
@@ -185,12 +182,146 @@ pub fn extract(
         begins(Part::Measure);
         report.measure_chart(&surface);
     }
+    if let Some(earlier) = earlier {
+        let moved = moved(&earlier.positions, &surface, &told.settings)?;
+        report.warm_start = Some(WarmStart { used: warmed, reason: cooled, moved });
+    }
     report.attempts = made;
     report.evaluations = Evaluations::new(&sampler.tally().by_stage(), report.vertices);
     if let Some(error) = &refusal {
         report.verdict.fail(error.code(), error.to_string(), &error.places());
     }
     Ok(Extracted { surface, report, refusal })
+}
+
+/// A surface that passed its certificate, or why there is none.
+type Passed = Result<(Surface, Report), String>;
+
+/// Makes a surface of the sampler's field by a warm start from an `earlier` one and by nothing else. `spec` is what the earlier
+/// one was made by; its lattice is taken, and what it says of components and handles.
+///
+/// # Errors
+/// [`ShrinkError`] when the token was raised, or when the shape has not the component that is asked for.
+///
+/// # Panics
+/// When the earlier surface is on another lattice.
+fn warmed(sampler: &Sampler<'_>, spec: &ShrinkSpec, earlier: &Earlier) -> Result<Passed, ShrinkError> {
+    let told = Told { settings: *sampler.settings(), fraction: AtomicU32::new(0) };
+    let mended = study(sampler, spec, 0)?;
+    Ok(Run { sampler, spec, told: &told, begins: &|_| {} }.warm(earlier, mended.as_ref())?)
+}
+
+/// A `surface` of the sampler's field with other `diagonals`, measured, and repaired where that folds it or lets it cross.
+///
+/// # Errors
+/// [`ShrinkError`] when the token was raised, or when the shape has not the component that is asked for.
+fn relaid(
+    sampler: &Sampler<'_>,
+    spec: &ShrinkSpec,
+    surface: &Surface,
+    diagonals: &[bool],
+) -> Result<(Surface, Report), ShrinkError> {
+    let told = Told { settings: *sampler.settings(), fraction: AtomicU32::new(0) };
+    let mended = study(sampler, spec, 0)?;
+    let Earlier { lattice, positions, normals, .. } = surface.earlier();
+    let wrap = Wrap {
+        lattice: SphereLattice { free: vec![false; lattice.quads.len()], ..lattice },
+        positions,
+        values: surface.values.iter().map(|&value| value.into()).collect(),
+        gradients: normals.iter().zip(&surface.gradient_norms).map(|(n, &length)| *n * f64::from(length)).collect(),
+        diagonals: diagonals.to_vec(),
+    };
+    let mut best = None;
+    let run = Run { sampler, spec, told: &told, begins: &|_| {} };
+    run.certified(wrap, mended.as_ref(), Turn { index: 0 }, &mut best)?;
+    Ok(best.expect("one surface at least was measured"))
+}
+
+/// What all attempts of an extraction share.
+struct Run<'r, 'a> {
+    sampler: &'r Sampler<'a>,
+    spec: &'r ShrinkSpec,
+    told: &'r Told<'r>,
+    begins: &'r dyn Fn(Part),
+}
+
+/// The place of an attempt among all, a warm start included, from 0.
+#[derive(Clone, Copy)]
+struct Turn {
+    index: u32,
+}
+
+impl Turn {
+    /// Where its share of the progress starts, where measuring begins, and where it ends.
+    fn share(self) -> [f32; 3] {
+        let (start, end) = (ENDS[self.index as usize], ENDS[self.index as usize + 1]);
+        [start, start + SHRINKING * (end - start), end]
+    }
+    fn shrinking(self, told: &Told<'_>, progress: Progress) {
+        let [start, measured_from, _] = self.share();
+        told.tell(self.index, start, measured_from, progress);
+    }
+    fn measuring(self, told: &Told<'_>) {
+        let [_, measured_from, end] = self.share();
+        told.tell(self.index, measured_from, end, Progress { stage: "measure", ..Progress::default() });
+    }
+}
+
+impl Run<'_, '_> {
+    /// The surface that a warm start makes.
+    fn warm(&self, earlier: &Earlier, mended: Option<&Study<'_>>) -> Result<Passed, Canceled> {
+        assert_eq!(earlier.lattice.spec, self.spec.lattice, "a warm start keeps the lattice");
+        let turn = Turn { index: 0 };
+        let progress = |progress: Progress| turn.shrinking(self.told, progress);
+        let settings = Settings { progress: &progress, ..self.told.settings };
+        let field = field_of(self.sampler, mended);
+        let Some(wrap) = warm(&Sampler::new(field, settings, self.sampler.tally()), earlier)? else {
+            return Ok(Err("too much of the earlier surface folds over on the way".to_owned()));
+        };
+        let mut best = None;
+        self.certified(wrap, mended, turn, &mut best)?;
+        let (surface, report) = best.expect("one surface at least was measured");
+        Ok(if report.verdict.passed { Ok((surface, report)) } else { Err(report.verdict.summary()) })
+    }
+
+    /// Measures a wrap; what the certificate finds folded or crossing is first repaired where it is, and measured again.
+    /// Every surface is held against the best one. Returns the places where the last one was found wanting.
+    fn certified(
+        &self,
+        mut wrap: Wrap,
+        mended: Option<&Study<'_>>,
+        turn: Turn,
+        best: &mut Option<(Surface, Report)>,
+    ) -> Result<Vec<DVec3>, Canceled> {
+        let tally = self.sampler.tally();
+        let quiet = Sampler::new(field_of(self.sampler, mended), self.told.settings, tally);
+        let (mut least, mut vain) = (u64::MAX, 0);
+        for repair in 0.. {
+            (self.begins)(Part::Measure);
+            turn.measuring(self.told);
+            let surface = Surface::new(wrap.clone());
+            let mut report = measure(&surface, &quiet, &tally.by_stage(), self.spec)?;
+            if let Some(study) = mended {
+                let invented_area = invented(&surface, study, self.sampler)?;
+                report.topology = Some(Topology { invented_area, ..study.topology.clone() });
+            }
+            let (passed, places) = (report.verdict.passed, report.verdict.places());
+            let local = report.flips.surface + report.self_intersections;
+            vain = if local < least { 0 } else { vain + 1 };
+            least = least.min(local);
+            // of equals the later one: it was made with more effort
+            if passed || best.as_ref().is_none_or(|(_, other)| rank(&report) <= rank(other)) {
+                *best = Some((surface, report));
+            }
+            let enough = repair >= REPAIRS && (local > FEW || repair == MOST_REPAIRS || vain == VAIN);
+            if passed || local == 0 || enough || self.spec.method == Method::Paper {
+                return Ok(places);
+            }
+            (self.begins)(Part::Shrink);
+            mend(&quiet, &mut wrap, &places, 1 + repair)?;
+        }
+        unreachable!("the last repair returns")
+    }
 }
 
 /// The field to wrap: as it is, or mended.
@@ -314,7 +445,7 @@ mod tests {
             let tally = Tally::new();
             let settings = Settings { progress: &progress, ..*settings };
             let sampler = Sampler::new(field, settings, &tally);
-            let made = extract(&sampler, spec, None, budget, &|part| parts.lock().expect("no panic").push(part));
+            let made = extract(&sampler, spec, None, budget, None, &|part| parts.lock().expect("no panic").push(part));
             let (news, parts) = (news.lock().expect("no panic").clone(), parts.lock().expect("no panic").clone());
             (made, news, parts, tally.total().total())
         })
@@ -365,6 +496,47 @@ mod tests {
         assert_eq!(run(&field, &paper, Budget::default()).0.expect("a surface").report.attempts, 1);
     }
 
+    /// What becomes of a scene that begins from another one's surface.
+    fn began(from: serde_json::Value, to: serde_json::Value, budget: Budget) -> Result<Extracted, ShrinkError> {
+        let spec = spec(LatticeSpec::Octahedral { n: 24 });
+        let earlier = run(&scene(from), &spec, Budget::default()).0.expect("a surface").surface.earlier();
+        with_settings(2, |settings| {
+            let (field, tally) = (scene(to), Tally::new());
+            let sampler = Sampler::new(&field, *settings, &tally);
+            extract(&sampler, &spec, None, budget, Some(&earlier), &|_| {})
+        })
+    }
+
+    #[test]
+    fn a_warm_start_that_passes_is_the_result_and_keeps_triangles_and_places() {
+        let pill = |length: f64| json!({"capsule": {"from": [-length, 0, 0], "to": [length, 0, 0], "radius": 0.35}});
+        let made = began(pill(0.3), pill(0.33), Budget::default()).expect("a surface");
+        let report = &made.report;
+        let warm_start = report.warm_start.clone().expect("it was asked for");
+        assert!(report.verdict.passed && warm_start.used && warm_start.reason.is_none(), "{report:?}");
+        assert_eq!(report.attempts, 1);
+        assert!(report.evaluations.per_vertex < 4.0 && !report.evaluations.by_stage.contains_key("contract"));
+        assert!(warm_start.moved.moved.max > 0.01 && warm_start.moved.drift.mean < 1e-3, "{warm_start:?}");
+    }
+
+    #[test]
+    fn a_warm_start_that_does_not_pass_is_followed_by_the_attempts_and_says_why() {
+        let (from, to) = (json!({"sphere": {"radius": 0.2}}), json!({"ellipsoid": {"radii": [0.9, 0.12, 0.12]}}));
+        let far = json!({"translate": {"by": [0, 0.7, 0], "of": to}});
+        let made =
+            began(from.clone(), far.clone(), Budget { attempts: Some(1), evaluations: None }).expect("a surface");
+        let warm_start = made.report.warm_start.expect("it was asked for");
+        assert!(made.report.verdict.passed && !warm_start.used, "{warm_start:?}");
+        assert!(warm_start.reason.is_some_and(|reason| !reason.is_empty()));
+        assert_eq!(made.report.attempts, 2, "the warm start is none of the budget's attempts");
+        assert!(made.report.evaluations.by_stage.contains_key("warm"), "what it took is counted");
+        // the other ball is beyond the reach of the first one's surface, and the certificate misses it
+        let two =
+            json!({"union": {"of": [from, {"translate": {"by": [0.6, 0, 0], "of": {"sphere": {"radius": 0.2}}}}]}});
+        let refused = began(from, two, Budget::default()).expect_err("two balls");
+        assert!(matches!(refused, ShrinkError::Components { .. }), "{refused}");
+    }
+
     #[test]
     fn a_raised_token_ends_it_in_any_part() {
         let (field, spec) = hopeless();
@@ -381,7 +553,8 @@ mod tests {
                         cancel.cancel();
                     }
                 };
-                let made = extract(&Sampler::new(&field, settings, &tally), &spec, None, Budget::default(), &begins);
+                let made =
+                    extract(&Sampler::new(&field, settings, &tally), &spec, None, Budget::default(), None, &begins);
                 assert!(matches!(made, Err(ShrinkError::Canceled(_))), "stopped at part {stop_at}");
             });
         }

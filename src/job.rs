@@ -61,17 +61,20 @@ pub enum JobKind {
     Shrink,
     /// Fit a network to meshes.
     Fit,
+    /// Carry a gradient of a surface's vertices back to its network.
+    Sensitivity,
 }
 
 impl JobKind {
     /// All of them.
-    pub const ALL: [JobKind; 2] = [JobKind::Shrink, JobKind::Fit];
+    pub const ALL: [JobKind; 3] = [JobKind::Shrink, JobKind::Fit, JobKind::Sensitivity];
 
     /// The name in JSON and in the database.
     pub fn name(self) -> &'static str {
         match self {
             JobKind::Shrink => "shrink",
             JobKind::Fit => "fit",
+            JobKind::Sensitivity => "sensitivity",
         }
     }
     /// The kind of that name.
@@ -153,7 +156,7 @@ pub struct ProgressView {
 /// One finished output of a job.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Output {
-    /// Its name: `glb`, `surface`, `svg`, `preview`, `network` or `report`.
+    /// Its name: `glb`, `surface`, `svg`, `preview`, `network`, `sensitivity` or `report`.
     pub name: String,
     /// Where it is downloaded.
     pub href: String,
@@ -199,12 +202,15 @@ pub struct Job {
     /// How it is fitted, where the kind is `fit`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fit: Option<crate::fit::FitSpec>,
+    /// The job whose surface is differentiated, where the kind is `sensitivity`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub of: Option<JobId>,
     /// How far it has come, once it runs.
     pub progress: Option<ProgressView>,
     /// Seconds the rest may take.
     pub eta_s: Option<f64>,
     /// What was measured about the result: the same object as the output `report`. A job that failed with `not_certified`
-    /// has it too, about the best surface that was made. A fit has its own report.
+    /// has it too, about the best surface that was made. A fit and a sensitivity have reports of their own.
     // kept as a value, so that records of another version can still be shown
     #[schema(value_type = Option<crate::measure::AnyReport>)]
     pub metrics: Option<serde_json::Value>,

@@ -15,6 +15,7 @@ pub mod distortion;
 pub mod evaluation;
 pub mod intersection;
 pub mod marching_cubes;
+pub mod moved;
 pub mod nearest;
 pub mod predicates;
 pub mod report;

@@ -35,6 +35,7 @@ mod tips;
 mod topology;
 mod unfold;
 mod untangle;
+pub mod warm;
 mod zero;
 
 use crate::field::{Field, Sampler};

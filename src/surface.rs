@@ -14,6 +14,7 @@ pub mod tensors;
 use crate::settings::{Canceled, Settings};
 use crate::shrink::chart::relax;
 use crate::shrink::lattice::SphereLattice;
+use crate::shrink::warm::Earlier;
 use crate::shrink::{Distortion, Wrap};
 use glam::{DVec3, Vec3};
 
@@ -52,6 +53,20 @@ impl Surface {
             chart_triangles: wrap.lattice.chart_triangles(&wrap.diagonals),
             lattice: wrap.lattice,
             relaxed_uv: None,
+        }
+    }
+
+    /// The surface as a warm start begins from it.
+    ///
+    /// # Panics
+    /// When its triangles are not those of its lattice.
+    pub fn earlier(&self) -> Earlier {
+        let wide = |list: &[[f32; 3]]| -> Vec<DVec3> { list.iter().map(|&p| Vec3::from(p).as_dvec3()).collect() };
+        Earlier {
+            positions: wide(&self.positions),
+            normals: wide(&self.normals),
+            diagonals: self.lattice.diagonals_of(&self.triangles).expect("triangles of the lattice"),
+            lattice: self.lattice.clone(),
         }
     }
 

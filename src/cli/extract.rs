@@ -1,9 +1,11 @@
 //! `shrinkd extract`: one field in, files out, and one line that says how good they are.
 
+use super::options::MethodArg;
 use super::{BAD_INPUT, BAD_USAGE, ExtractArgs, FAILED, NOT_WRAPPED, STEPS, fail, progress_bar};
 use crate::job::failure::{Ended, Failure};
 use crate::job::pipeline::{self, Asked, CurveMade, Made, Opened};
 use crate::job::spec::{FieldSpec, OutputName};
+use crate::measure::report::WarmStart;
 use crate::measure::verdict::Finding;
 use crate::settings::{CancelToken, Progress, Settings};
 use crate::shrink::{Density, ShrinkSpec};
@@ -30,6 +32,12 @@ fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
     let mut opened = open(&args.field, |bytes| pipeline::open(&spec, Some(bytes), ""))?;
     if let Some(path) = &args.weight {
         opened = open(path, |bytes| opened.with_weight(&FieldSpec::default(), Some(bytes), ""))?;
+    }
+    if let Some(path) = &args.warm_start {
+        if args.shrink.method == MethodArg::Paper {
+            return Err((BAD_USAGE, in_field("--warm-start is for the method adaptive")));
+        }
+        opened = open(path, |bytes| opened.with_warm_start(bytes, args.lattice))?;
     }
     let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads).build();
     let pool = pool.map_err(|e| (FAILED, e.to_string()))?;
@@ -91,6 +99,9 @@ fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
     }
     println!("{}", summary(args, &made, clock.elapsed().as_secs_f64()));
     let verdict = &made.report.verdict;
+    if let Some(WarmStart { used: false, reason: Some(reason), .. }) = &made.report.warm_start {
+        eprintln!("shrinkd: {}", in_field(&format!("the warm start did not pass, so its UVs were not kept: {reason}")));
+    }
     for warning in &verdict.warnings {
         eprintln!("shrinkd: {}", in_field(&finding("warning: ", warning)));
     }

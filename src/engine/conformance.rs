@@ -11,6 +11,8 @@ use super::{
     Claim, Engine, EngineError, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Renewal, Submitted, Update,
     follow,
 };
+use crate::blobs::BlobId;
+use crate::job::spec::{WarmStartSpec, Work};
 use crate::job::{Event, EventKind, Failure, JobId, JobSpec, Output, ProgressView, State};
 use futures::StreamExt;
 use serde_json::json;
@@ -52,6 +54,7 @@ pub async fn run(engine: Arc<dyn Engine>) {
     a_waiting_worker_gets_a_job_as_it_comes(&engine).await;
     lists_are_newest_first_paged_and_filtered(&engine).await;
     only_an_ended_job_is_forgotten(&engine).await;
+    a_surface_is_kept_for_the_jobs_that_begin_from_it(&engine).await;
     engine.health().await.expect("healthy");
 }
 
@@ -156,6 +159,13 @@ async fn a_key_makes_a_submit_repeatable(engine: &Arc<dyn Engine>) {
     assert_eq!(created, 1, "one key, one job");
     assert!(answers.windows(2).all(|w| w[0] == w[1]), "every answer is the same");
     assert_eq!(engine.submit(keyed("two")).await.expect("answers"), Submitted::KeyConflict);
+    let recall = async |fingerprint: &str, key: &str| {
+        let key = IdempotencyKey { key: key.to_owned(), fingerprint: fingerprint.to_owned() };
+        engine.recall(key).await.expect("answers")
+    };
+    assert_eq!(recall("one", "k").await, Some(Submitted::Replayed(answers[0].clone())));
+    assert_eq!(recall("two", "k").await, Some(Submitted::KeyConflict));
+    assert_eq!(recall("one", "new").await, None);
     let claim = claim_one(engine, "a").await;
     engine.finish(&claim, Outcome::Canceled).await.expect("finishes");
     let replayed = engine.submit(keyed("one")).await.expect("answers");
@@ -331,4 +341,28 @@ async fn only_an_ended_job_is_forgotten(engine: &Arc<dyn Engine>) {
     assert_eq!(engine.forget(ids[1]).await.expect("forgets"), Forgotten::Gone(vec!["shared".to_owned()]));
     assert_eq!(engine.forget(ids[1]).await.expect("answers"), Forgotten::Unknown);
     assert_eq!(engine.get(ids[1]).await.expect("reads"), None);
+}
+
+async fn a_surface_is_kept_for_the_jobs_that_begin_from_it(engine: &Arc<dyn Engine>) {
+    let surface = BlobId::of(b"surface");
+    let earlier = submit(engine, new_job()).await;
+    let claim = claim_one(engine, "a").await;
+    engine.finish(&claim, success(&surface.hex())).await.expect("finishes");
+    let mut job = new_job();
+    let Work::Shrink(work) = &mut job.spec.work else { panic!("{:?}", job.spec) };
+    work.warm_start = Some(WarmStartSpec { job: earlier, surface: Some(surface) });
+    let later = submit(engine, job.clone()).await;
+    assert_eq!(engine.spec(later).await.expect("reads"), Some(job.spec.clone()));
+    let gone = engine.forget(earlier).await.expect("forgets");
+    assert_eq!(gone, Forgotten::Gone(Vec::new()), "a job that waits begins from it");
+    let claim = claim_one(engine, "a").await;
+    assert_eq!(claim.spec, job.spec, "the worker is told which blob");
+    engine.finish(&claim, success("other")).await.expect("finishes");
+    assert_eq!(
+        engine.get(later).await.expect("reads").expect("is there").outputs.len(),
+        1,
+        "it is no output of its own"
+    );
+    let gone = engine.forget(later).await.expect("forgets");
+    assert_eq!(gone, Forgotten::Gone(vec!["other".to_owned(), surface.hex()]));
 }

@@ -9,8 +9,8 @@ mod schema;
 mod writer;
 
 use super::{
-    Changes, Claim, Engine, EngineError, EventPage, Forgotten, ListQuery, NewJob, Outcome, Page, Renewal, Submitted,
-    Update,
+    Changes, Claim, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Page,
+    Renewal, Submitted, Update,
 };
 use crate::job::{Failure, Job, JobId, JobSpec, State};
 use records::{Change, Ctx};
@@ -140,8 +140,18 @@ impl Engine for SqliteEngine {
         Ok(submitted)
     }
 
+    async fn recall(&self, key: IdempotencyKey) -> Result<Option<Submitted>, EngineError> {
+        self.write(move |ctx| recall(ctx, &key)).await
+    }
+
     async fn get(&self, id: JobId) -> Result<Option<Job>, EngineError> {
         self.read(move |c| records::read(c, id)).await
+    }
+
+    async fn spec(&self, id: JobId) -> Result<Option<JobSpec>, EngineError> {
+        let stored = self.read(move |c| records::spec(c, id)).await?;
+        let read = |value| JobSpec::from_value(&value).map_err(|faults| EngineError::Store(format!("{faults:?}")));
+        stored.map(read).transpose()
     }
 
     async fn list(&self, query: ListQuery) -> Result<Page, EngineError> {
@@ -167,14 +177,15 @@ impl Engine for SqliteEngine {
             if !job.state.ended() {
                 return Ok(Forgotten::Running);
             }
+            let mut unused = records::named_blobs(ctx.connection, id)?;
             ctx.connection.execute("DELETE FROM jobs WHERE id = ?1", [id.to_string()])?;
-            let mut unused = Vec::new();
-            for output in &job.outputs {
-                let named = "SELECT 1 FROM outputs WHERE sha256 = ?1 LIMIT 1";
-                if ctx.connection.query_row(named, [&output.sha256], |_| Ok(())).optional()?.is_none() {
-                    unused.push(output.sha256.clone());
-                }
+            let mut still_named = ctx.connection.prepare_cached("SELECT 1 FROM outputs WHERE sha256 = ?1 LIMIT 1")?;
+            let mut kept = Vec::new();
+            for hash in &unused {
+                kept.push(still_named.exists([hash])?);
             }
+            let mut kept = kept.into_iter();
+            unused.retain(|_| kept.next() == Some(false));
             Ok(Forgotten::Gone(unused))
         })
         .await
@@ -271,17 +282,25 @@ impl Engine for SqliteEngine {
     }
 }
 
+/// The answer to an earlier submit with this key.
+fn recall(ctx: &mut Ctx<'_>, key: &IdempotencyKey) -> rusqlite::Result<Option<Submitted>> {
+    ctx.connection.execute("DELETE FROM idempotency WHERE expires_at <= ?1", [ctx.now])?;
+    let known = "SELECT fingerprint, answer FROM idempotency WHERE key = ?1";
+    let row = |row: &rusqlite::Row<'_>| Ok((row.get::<_, String>(0)?, row.get::<_, String>(1)?));
+    let Some((fingerprint, answer)) = ctx.connection.query_row(known, [&key.key], row).optional()? else {
+        return Ok(None);
+    };
+    if fingerprint != key.fingerprint {
+        return Ok(Some(Submitted::KeyConflict));
+    }
+    Ok(Some(Submitted::Replayed(records::from_json(&answer)?)))
+}
+
 fn submit(ctx: &mut Ctx<'_>, new: &NewJob) -> rusqlite::Result<Submitted> {
-    if let Some(key) = &new.key {
-        ctx.connection.execute("DELETE FROM idempotency WHERE expires_at <= ?1", [ctx.now])?;
-        let known = "SELECT fingerprint, answer FROM idempotency WHERE key = ?1";
-        let row = |row: &rusqlite::Row<'_>| Ok((row.get::<_, String>(0)?, row.get::<_, String>(1)?));
-        if let Some((fingerprint, answer)) = ctx.connection.query_row(known, [&key.key], row).optional()? {
-            if fingerprint != key.fingerprint {
-                return Ok(Submitted::KeyConflict);
-            }
-            return Ok(Submitted::Replayed(records::from_json(&answer)?));
-        }
+    if let Some(key) = &new.key
+        && let Some(answer) = recall(ctx, key)?
+    {
+        return Ok(answer);
     }
     records::insert(ctx, new)?;
     let job = records::read(ctx.connection, new.id)?.ok_or(rusqlite::Error::QueryReturnedNoRows)?;

@@ -223,6 +223,22 @@ pub fn open_mesh(bytes: &[u8]) -> Result<MeshField, FieldError> {
     }
 }
 
+/// The latent code that `options` choose for the network in the bytes: the one that they give, or a row of those that come
+/// with it.
+///
+/// # Errors
+/// As [`open`]; [`FieldError::Invalid`] when the bytes are no network, or when it takes no latent code.
+pub fn latent_code(bytes: &[u8], options: &FieldOptions) -> Result<Vec<f32>, FieldError> {
+    let format = Format::detect(bytes)?;
+    let no_code = || vec![options::fault("/latent", "not_offered", "the field has no latent code")];
+    refuse(if format.is_network() { options.faults() } else { no_code() })?;
+    let (network, _) = network::read(bytes, format, options)?;
+    let mut faults = if network.latent_size == 0 { no_code() } else { Vec::new() };
+    let code = options.latent_of(&network, &mut faults);
+    refuse(faults)?;
+    Ok(code)
+}
+
 /// Says what the bytes hold, having read and checked them as [`open`] would.
 ///
 /// # Errors

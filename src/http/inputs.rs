@@ -33,6 +33,11 @@ impl Input {
         matches!(self.description, Description::Mesh { .. })
     }
 
+    /// Whether it is a network.
+    pub(super) fn is_network(&self) -> bool {
+        matches!(self.description, Description::Network { .. })
+    }
+
     /// 3 for surfaces, 2 for curves.
     pub(super) fn dimension(&self) -> u8 {
         match self.description {

@@ -1,12 +1,15 @@
 //! `/v1/jobs`: submit, look, cancel, forget.
 
+pub(super) mod sensitivity;
+mod warm_start;
+
 use super::inputs::{self, Input};
 use super::{App, Problem, body, conditional, query};
 use crate::blobs::BlobId;
 use crate::engine::{Forgotten, IdempotencyKey, NewJob, Submitted};
 use crate::field::{Fault, FieldError};
 use crate::job::spec::{FieldSpec, Fitting, Work};
-use crate::job::{Failure, Job, JobId, JobSpec, pipeline};
+use crate::job::{Failure, Job, JobId, JobKind, JobSpec, OutputName, pipeline};
 use crate::shrink::Method;
 use axum::Json;
 use axum::body::Body;
@@ -81,16 +84,46 @@ pub async fn submit(
     // the keys of a JSON value are sorted, so that spaces and order do not make another request
     let fingerprint = BlobId::of(request.to_string().as_bytes()).hex();
     let spec = JobSpec::from_value(&request).map_err(|faults| Problem::invalid_request("", &faults))?;
+    if spec.work.kind() == JobKind::Sensitivity {
+        let detail = "a sensitivity is asked for by POST /v1/jobs/{id}/sensitivity".to_owned();
+        let fault = Fault { pointer: "/kind".to_owned(), code: "not_offered", detail };
+        return Err(Problem::invalid_request("", &[fault]));
+    }
     let dimension = check_fields(&app, &spec).await?;
-    let spec = spec.for_dimension(dimension, &request).map_err(|faults| Problem::invalid_request("", &faults))?;
+    let mut spec = spec.for_dimension(dimension, &request).map_err(|faults| Problem::invalid_request("", &faults))?;
+    let key = key.map(|key| IdempotencyKey { key, fingerprint });
+    // a repeated request has its answer, also when the job that it began from is forgotten by now
+    let warm = matches!(&spec.work, Work::Shrink(work) if work.warm_start.is_some());
+    let recalled = match &key {
+        Some(key) if warm && !validate_only => app.engine.recall(key.clone()).await?,
+        _ => None,
+    };
+    // no blob goes from the moment that it is looked up until the new job's record names it
+    let promise = match (warm, &recalled) {
+        (true, None) => {
+            let promise = app.blobs.promise().await;
+            warm_start::resolve(&app, &mut spec).await?;
+            Some(promise)
+        }
+        _ => None,
+    };
     if validate_only {
         return Ok(Json(estimate(&spec, dimension)).into_response());
     }
     if app.stop.is_cancelled() {
         return Err(Problem::unavailable("stopping", "the service is stopping"));
     }
-    let key = key.map(|key| IdempotencyKey { key, fingerprint });
-    let (mut job, replayed) = match app.engine.submit(NewJob { id: JobId::new(), spec, key }).await? {
+    let submitted = match recalled {
+        Some(answer) => answer,
+        None => app.engine.submit(NewJob { id: JobId::new(), spec, key }).await?,
+    };
+    drop(promise);
+    answer_submit(&app, &headers, submitted).await
+}
+
+/// The answer to a submit, after the wait that `Prefer` asks for.
+async fn answer_submit(app: &App, headers: &HeaderMap, submitted: Submitted) -> Result<Response, Problem> {
+    let (mut job, replayed) = match submitted {
         Submitted::Created(job) => (job, false),
         Submitted::Replayed(job) => (job, true),
         Submitted::KeyConflict => {
@@ -113,8 +146,8 @@ pub async fn submit(
     if replayed {
         answer.insert(HeaderName::from_static("idempotent-replayed"), HeaderValue::from_static("true"));
     }
-    if let Some(wait) = query::prefer_wait(&headers) {
-        job = wait_until(&app, job.id, wait, |job| job.state.ended()).await?.unwrap_or(job);
+    if let Some(wait) = query::prefer_wait(headers) {
+        job = wait_until(app, job.id, wait, |job| job.state.ended()).await?.unwrap_or(job);
         let applied = HeaderValue::from_str(&format!("wait={}", wait.as_secs())).map_err(|_| Problem::internal())?;
         answer.insert(HeaderName::from_static("preference-applied"), applied);
     }
@@ -287,6 +320,7 @@ async fn check_fields(app: &App, spec: &JobSpec) -> Result<u8, Problem> {
             check_meshes(app, &fitting.meshes).await?;
             return Ok(3);
         }
+        Work::Sensitivity(_) => return Ok(3),
     };
     let dimension = check_field(app, &work.field, "/field").await?;
     if let Some(weight) = &work.weight
@@ -297,6 +331,12 @@ async fn check_fields(app: &App, spec: &JobSpec) -> Result<u8, Problem> {
         return Err(Problem::invalid_request("", &[fault]));
     }
     Ok(dimension)
+}
+
+/// The blob of a job's output `surface`, if it made one.
+fn surface_blob(job: &Job) -> Option<BlobId> {
+    let output = job.outputs.iter().find(|output| output.name == OutputName::Surface.name());
+    output.and_then(|output| BlobId::from_hex(&output.sha256))
 }
 
 /// What an input holds that is named at `pointer`.
@@ -347,6 +387,7 @@ fn estimate(spec: &JobSpec, dimension: u8) -> Estimate {
             let evaluations = meshes.len() as u64 * u64::from(fit.samples);
             return Estimate { valid: true, vertices: 0, evaluations };
         }
+        Work::Sensitivity(_) => return Estimate { valid: true, vertices: 0, evaluations: 0 },
     };
     if dimension == 2 {
         let vertices = u64::from(shrink.curve_samples());
@@ -431,6 +472,10 @@ pub struct ShrinkRequest {
     /// What samples are spread by, where the density is `weight`: its values, which need not be distances.
     #[schema(required = false)]
     weight: Option<FieldSpec>,
+    /// The job whose output `surface` it begins from, and keeps the UVs of: one that succeeded by the method `adaptive` on the
+    /// same lattice, of a field nearby.
+    #[schema(required = false)]
+    warm_start: Option<JobId>,
     /// How it is shrunk.
     #[schema(required = false)]
     shrink: crate::shrink::ShrinkSpec,

@@ -88,6 +88,7 @@ impl Failure {
                 | "unsupported_input"
                 | "unknown_input"
                 | "no_weight"
+                | "warm_start"
         )
     }
 

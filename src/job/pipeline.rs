@@ -6,7 +6,7 @@ mod sensing;
 
 pub use fitting::{Kept, open_mesh, run_fit};
 pub use plane::{CurveMade, make_curve};
-pub use sensing::{Carried, SensitivityReport, sensitivity_of};
+pub use sensing::{Carried, SensitivityReport, run_sensitivity, sensitivity_of};
 
 use super::failure::{Ended, Failure};
 use super::spec::{FieldSpec, OutputName};
@@ -19,6 +19,8 @@ use crate::field::scene::Scene;
 use crate::field::{Field, FieldError, Sampler};
 use crate::measure::Report;
 use crate::settings::{Progress, Settings};
+use crate::shrink::lattice::LatticeSpec;
+use crate::shrink::warm::Earlier;
 use crate::shrink::{Method, ShrinkError, ShrinkSpec};
 use crate::surface;
 use serde::Serialize;
@@ -38,6 +40,8 @@ pub struct Opened {
     pub field: Box<dyn Field>,
     /// What `density: weight` goes by, if it was given.
     pub weight: Option<Box<dyn Field>>,
+    /// The surface that a warm start begins from, if there is one.
+    pub earlier: Option<Earlier>,
     /// The hash and the size of the field's bytes, and the options; written into the GLB.
     pub provenance: Value,
     /// What a network's file was taken for.
@@ -149,7 +153,7 @@ pub fn open(spec: &FieldSpec, bytes: Option<&[u8]>, at: &str) -> Result<Opened, 
         input::open(bytes, &spec.options).map_err(|e| Failure::from_field(&e, at))?;
     // the bytes of a scene in a request are its JSON without spaces, members in alphabetical order
     let provenance = json!({"sha256": BlobId::of(bytes).hex(), "bytes": bytes.len(), "options": spec.options});
-    Ok(Opened { field, weight: None, provenance, detected })
+    Ok(Opened { field, weight: None, earlier: None, provenance, detected })
 }
 
 impl Opened {
@@ -165,6 +169,18 @@ impl Opened {
         }
         self.weight = Some(opened.field);
         self.provenance["weight"] = opened.provenance;
+        Ok(self)
+    }
+
+    /// The same with the surface that a warm start begins from: the output `surface` of an earlier job, on this lattice.
+    pub fn with_warm_start(mut self, bytes: &[u8], lattice: LatticeSpec) -> Result<Self, Box<Failure>> {
+        let wrong = |detail: String| Box::new(Failure::new("warm_start", "the surface is none to start from", detail));
+        if self.field.dimension() != 3 {
+            return Err(wrong("a curve has no warm start: the field has dimension 2".to_owned()));
+        }
+        let earlier = surface::tensors::from_safetensors(bytes, lattice).map_err(|e| wrong(e.to_string()))?;
+        self.provenance["warm_start"] = json!({"sha256": BlobId::of(bytes).hex(), "bytes": bytes.len()});
+        self.earlier = Some(earlier);
         Ok(self)
     }
 }
@@ -201,7 +217,9 @@ pub fn make(opened: &Opened, asked: &Asked<'_>, settings: Settings<'_>) -> Resul
     let tally = Tally::new();
     let sampler = Sampler::new(opened.field.as_ref(), Settings { progress: &told, ..settings }, &tally);
     let clock = Clock::default();
-    let made = extract(&sampler, asked.shrink, opened.weight.as_deref(), asked.budget, &|part| clock.begin(Some(part)));
+    let begins = |part| clock.begin(Some(part));
+    let (weight, earlier) = (opened.weight.as_deref(), opened.earlier.as_ref());
+    let made = extract(&sampler, asked.shrink, weight, asked.budget, earlier, &begins);
     clock.begin(None);
     let Extracted { surface, mut report, refusal } = made?;
     report.network = opened.detected.clone();
@@ -217,7 +235,7 @@ pub fn make(opened: &Opened, asked: &Asked<'_>, settings: Settings<'_>) -> Resul
         Ok(match output {
             OutputName::Glb => surface::gltf::to_glb(&surface, &lasting, &opened.provenance),
             OutputName::Surface => surface::tensors::to_safetensors(&surface),
-            OutputName::Svg | OutputName::Network => {
+            OutputName::Svg | OutputName::Network | OutputName::Sensitivity => {
                 let detail = format!("{} is not made of a field of dimension 3", output.name());
                 return Err(Failure::new("dimension", "the field has the wrong dimension for this", detail).into());
             }

@@ -5,7 +5,7 @@
 
 mod read;
 
-use super::JobKind;
+use super::{JobId, JobKind};
 use crate::blobs::BlobId;
 use crate::extract::Budget;
 use crate::field::Fault;
@@ -50,27 +50,31 @@ pub enum OutputName {
     Preview,
     /// The network that was fitted, as safetensors with its architecture.
     Network,
+    /// Derivatives by a latent code and by weights, as safetensors.
+    Sensitivity,
     /// Everything measured, as JSON.
     Report,
 }
 
 impl OutputName {
     /// All of them.
-    pub const ALL: [OutputName; 6] = [
+    pub const ALL: [OutputName; 7] = [
         OutputName::Glb,
         OutputName::Surface,
         OutputName::Svg,
         OutputName::Preview,
         OutputName::Network,
+        OutputName::Sensitivity,
         OutputName::Report,
     ];
 
     /// Those that jobs of a kind can make.
     pub fn of(kind: JobKind) -> &'static [OutputName] {
-        use OutputName::{Glb, Network, Preview, Report, Surface, Svg};
+        use OutputName::{Glb, Network, Preview, Report, Sensitivity, Surface, Svg};
         match kind {
             JobKind::Shrink => &[Glb, Surface, Svg, Preview, Report],
             JobKind::Fit => &[Network, Report],
+            JobKind::Sensitivity => &[Sensitivity, Report],
         }
     }
 
@@ -82,6 +86,7 @@ impl OutputName {
             OutputName::Svg => "svg",
             OutputName::Preview => "preview",
             OutputName::Network => "network",
+            OutputName::Sensitivity => "sensitivity",
             OutputName::Report => "report",
         }
     }
@@ -94,7 +99,7 @@ impl OutputName {
         match self {
             OutputName::Glb => "model/gltf-binary",
             // no registered type; the one the format's own tools use is octet-stream
-            OutputName::Surface | OutputName::Network => "application/octet-stream",
+            OutputName::Surface | OutputName::Network | OutputName::Sensitivity => "application/octet-stream",
             OutputName::Svg => "image/svg+xml",
             OutputName::Preview => "image/png",
             OutputName::Report => "application/json",
@@ -104,7 +109,7 @@ impl OutputName {
     pub fn extension(self) -> &'static str {
         match self {
             OutputName::Glb => "glb",
-            OutputName::Surface | OutputName::Network => "safetensors",
+            OutputName::Surface | OutputName::Network | OutputName::Sensitivity => "safetensors",
             OutputName::Svg => "svg",
             OutputName::Preview => "png",
             OutputName::Report => "json",
@@ -128,6 +133,43 @@ pub struct FieldSpec {
     pub options: FieldOptions,
 }
 
+/// Which surface a warm start begins from.
+///
+/// A client names the job that made it, as text. When the job is accepted the surface's blob is looked up and stored with
+/// it, as an object, because the earlier job may be forgotten before this one runs.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[serde(into = "SpelledWarmStart")]
+pub struct WarmStartSpec {
+    /// The job that made it.
+    pub job: JobId,
+    /// Its output `surface`, once it was looked up.
+    pub surface: Option<BlobId>,
+}
+
+/// A [`WarmStartSpec`] as it is written.
+#[derive(Serialize)]
+#[serde(untagged)]
+enum SpelledWarmStart {
+    /// By a client.
+    Job(JobId),
+    /// In the engine.
+    Surface {
+        /// The job that made it.
+        job: JobId,
+        /// Its output `surface`.
+        surface: BlobId,
+    },
+}
+
+impl From<WarmStartSpec> for SpelledWarmStart {
+    fn from(WarmStartSpec { job, surface }: WarmStartSpec) -> Self {
+        match surface {
+            None => Self::Job(job),
+            Some(surface) => Self::Surface { job, surface },
+        }
+    }
+}
+
 /// A checked request for a job.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct JobSpec {
@@ -149,17 +191,34 @@ pub enum Work {
     Shrink(Box<Shrinking>),
     /// Fits a network to meshes.
     Fit(Fitting),
+    /// Carries a gradient of a surface's vertices back to its network.
+    Sensitivity(Box<Sensing>),
 }
 
 impl Work {
-    /// The uploaded inputs that it names, in the order of the request: of a surface those of its field and its weight.
-    pub fn inputs(&self) -> Vec<BlobId> {
+    /// The blobs that it works on: of a surface those of its field, its weight and its warm start, where it has them; the meshes
+    /// of a fit; the network, the surface and the gradient of a sensitivity.
+    pub fn blobs(&self) -> Vec<BlobId> {
         match self {
             Self::Shrink(work) => {
                 let weight = work.weight.as_ref().and_then(|weight| weight.input);
-                work.field.input.into_iter().chain(weight).collect()
+                let surface = work.warm_start.and_then(|warm_start| warm_start.surface);
+                work.field.input.into_iter().chain(weight).chain(surface).collect()
             }
             Self::Fit(fitting) => fitting.meshes.clone(),
+            Self::Sensitivity(work) => work.field.input.into_iter().chain([work.surface, work.gradient]).collect(),
+        }
+    }
+
+    /// Those of its blobs that are no inputs, and must be kept for it as its outputs are; by names that no output has.
+    pub fn held(&self) -> Vec<(&'static str, BlobId)> {
+        match self {
+            Self::Shrink(work) => {
+                let surface = work.warm_start.and_then(|warm_start| warm_start.surface);
+                surface.map(|id| ("warm_start", id)).into_iter().collect()
+            }
+            Self::Fit(_) => Vec::new(),
+            Self::Sensitivity(work) => vec![("of", work.surface), ("gradient", work.gradient)],
         }
     }
 
@@ -168,6 +227,7 @@ impl Work {
         match self {
             Self::Shrink(_) => JobKind::Shrink,
             Self::Fit(_) => JobKind::Fit,
+            Self::Sensitivity(_) => JobKind::Sensitivity,
         }
     }
 }
@@ -181,6 +241,20 @@ pub struct Fitting {
     pub fit: FitSpec,
 }
 
+/// A gradient of the vertices of a job's surface. Everything is looked up when the request is accepted, because the job that made the
+/// surface may be forgotten before this one runs.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Sensing {
+    /// The job that made the surface.
+    pub of: JobId,
+    /// Its field, a network.
+    pub field: FieldSpec,
+    /// Its output `surface`.
+    pub surface: BlobId,
+    /// The derivatives of a loss by the vertices.
+    pub gradient: BlobId,
+}
+
 /// A field, and how a sphere is shrunk onto it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Shrinking {
@@ -189,6 +263,9 @@ pub struct Shrinking {
     /// What samples are spread by, where the density is `weight`: its values, which need not be distances.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub weight: Option<FieldSpec>,
+    /// The surface that it begins from.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub warm_start: Option<WarmStartSpec>,
     /// How it is shrunk.
     pub shrink: ShrinkSpec,
     /// What may be spent on it.
@@ -213,6 +290,10 @@ impl JobSpec {
     pub fn for_dimension(mut self, dimension: u8, request: &Value) -> Result<Self, Vec<Fault>> {
         let Work::Shrink(shrinking) = &self.work else { return Ok(self) };
         if dimension == 2 {
+            if shrinking.warm_start.is_some() {
+                let detail = "a curve has no warm start, and this field has dimension 2".to_owned();
+                return Err(vec![Fault { pointer: "/warm_start".to_owned(), code: "dimension", detail }]);
+            }
             if shrinking.weight.is_some() {
                 let detail = "samples of a curve are spread by arc length, not by a weight";
                 return Err(vec![Fault {

@@ -185,7 +185,7 @@ impl Worker {
             let clock = Instant::now();
             let (spec, name) = (claim.spec, claim.id.to_string());
             let mut inputs = Vec::new();
-            for id in spec.work.inputs() {
+            for id in spec.work.blobs() {
                 inputs.push(read_input(&blobs, id).await?);
             }
             let before = match spec.work {
@@ -193,7 +193,7 @@ impl Worker {
                     tracing::warn!(%error, "the checkpoint could not be read; training begins anew");
                     None
                 }),
-                Work::Shrink(_) => None,
+                _ => None,
             };
             let (span, runtime) = (tracing::Span::current(), tokio::runtime::Handle::current());
             let compute = move || {
@@ -208,6 +208,9 @@ impl Worker {
                         let mut opened = pipeline::open(&work.field, next(&work.field), "/field")?;
                         if let Some(weight) = &work.weight {
                             opened = opened.with_weight(weight, next(weight), "/weight")?;
+                        }
+                        if let Some(surface) = work.warm_start.and_then(|_| inputs.next()) {
+                            opened = opened.with_warm_start(surface, work.shrink.lattice)?;
                         }
                         cancel.check()?;
                         let asked = Asked {
@@ -232,6 +235,9 @@ impl Worker {
                         };
                         let kept = Kept { before: before.as_deref(), keep: &keep };
                         pipeline::run_fit(fitting, &inputs, &spec.outputs, &kept, &settings)
+                    }
+                    Work::Sensitivity(sensing) => {
+                        pipeline::run_sensitivity(&sensing.field.options, &inputs, &spec.outputs, &settings)
                     }
                 }
             };

@@ -3,6 +3,7 @@
 use super::certificate::{certify, uv_flips};
 use super::distance::{Comparison, to_truth};
 use super::distortion::distortions;
+use super::moved::Moved;
 use super::verdict::{Figures, Verdict, judge};
 use crate::field::network::family::Detected;
 use crate::field::sampler::Tally;
@@ -61,7 +62,11 @@ pub struct Report {
     /// What a network's file was taken for, and what it does not say; filled in by the caller, who opened it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub network: Option<Detected>,
-    /// Attempts that were made at the surface, each with more effort; `evaluations` and `seconds` are those of all.
+    /// What became of the warm start, where one was asked for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub warm_start: Option<WarmStart>,
+    /// Attempts that were made at the surface, each with more effort, a warm start before them included; `evaluations` and
+    /// `seconds` are those of all.
     pub attempts: u32,
     /// Whether the result succeeds, and if not, why not and where.
     pub verdict: Verdict,
@@ -107,6 +112,7 @@ pub fn measure(
         options: spec.clone(),
         topology: None,
         network: None,
+        warm_start: None,
         attempts: 1,
         verdict: judge(&certificate, &comparison, vertices),
         version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -138,6 +144,20 @@ pub fn passes(report: &Report) -> Result<(), Vec<String>> {
     let Verdict { faults, warnings, .. } = &report.verdict;
     let misses: Vec<String> = faults.iter().chain(warnings).map(|finding| finding.detail.clone()).collect();
     if misses.is_empty() { Ok(()) } else { Err(misses) }
+}
+
+/// What became of a warm start: of beginning from an earlier surface.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
+pub struct WarmStart {
+    /// Whether the surface was made from the earlier one. If not, it was made as if there had been none: every place on the sphere
+    /// may be anywhere else on the surface than it was.
+    pub used: bool,
+    /// What the certificate said of the surface that the earlier one became, where that was not used.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub reason: Option<String>,
+    /// How far vertices are from where they were on the earlier surface, whether it was used or not.
+    #[serde(flatten)]
+    pub moved: Moved,
 }
 
 /// Field evaluations.

@@ -87,6 +87,15 @@ impl SphereLattice {
         triangles
     }
 
+    /// Which quads take their other diagonal in these triangles over welded vertices; `None` when the triangles are not
+    /// those of the lattice in its order, whatever the diagonals.
+    pub fn diagonals_of(&self, triangles: &[[u32; 3]]) -> Option<Vec<bool>> {
+        // corners 0, 1, 2 with the first diagonal, and 0, 1, 3 with the other
+        let other = |(i, quad): (usize, &[u32; 4])| Some(triangles.get(2 * i)?[2] != self.chart[quad[2] as usize]);
+        let diagonals: Vec<bool> = self.quads.iter().enumerate().map(other).collect::<Option<_>>()?;
+        (self.triangles(&diagonals) == triangles).then_some(diagonals)
+    }
+
     /// The same triangles over welded vertices.
     pub fn triangles(&self, diagonals: &[bool]) -> Vec<[u32; 3]> {
         let mut triangles = self.chart_triangles(diagonals);

@@ -4,6 +4,8 @@
 //! doubled and every polar sector has a pole of its own. Where the chart was relaxed, `TEXCOORD_0` is what it became and `TEXCOORD_1`
 //! the place on the sphere. The same surface and the same JSON give the same bytes.
 
+pub mod morph;
+
 use super::Surface;
 use super::checkerboard::{Tiles, texture};
 use glam::Vec3;
@@ -70,6 +72,14 @@ fn accessor(
     }
 }
 
+/// The range of positions.
+fn bounds(positions: &[[f32; 3]]) -> [Value; 2] {
+    let range = positions.iter().fold([[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]], |[lo, hi], p| {
+        [0, 1].map(|side| std::array::from_fn(|k| if side == 0 { lo[k].min(p[k]) } else { hi[k].max(p[k]) }))
+    });
+    range.map(|b| json!(b))
+}
+
 fn little_endian<const N: usize>(items: &[[f32; N]]) -> Vec<u8> {
     items.iter().flatten().flat_map(|x| x.to_le_bytes()).collect()
 }
@@ -81,6 +91,19 @@ fn unit(normal: [f32; 3]) -> [f32; 3] {
 
 /// The surface as a GLB. `report` and `provenance` (where the field came from) become the members of the asset's root `extras`.
 pub fn to_glb(surface: &Surface, report: &Value, provenance: &Value) -> Vec<u8> {
+    let (root, buffer) = document(surface, report, provenance);
+    written(root, buffer)
+}
+
+/// A document whose buffer is complete as a file.
+fn written(mut root: json::Root, buffer: Buffer) -> Vec<u8> {
+    root.buffers[0].byte_length = USize64::from(buffer.bytes.len());
+    root.buffer_views = buffer.views;
+    container(root.to_vec().expect("glTF of plain values is always JSON"), buffer.bytes)
+}
+
+/// The document of a surface, and its buffer so far: their sizes are entered when it is written.
+fn document(surface: &Surface, report: &Value, provenance: &Value) -> (json::Root, Buffer) {
     use json::accessor::{ComponentType, Type};
     use json::buffer::Target;
     let lattice = &surface.lattice;
@@ -96,18 +119,9 @@ pub fn to_glb(surface: &Surface, report: &Value, provenance: &Value) -> Vec<u8> 
 
     let mut buffer = Buffer::default();
     let mut accessors = Vec::new();
-    let bounds = positions.iter().fold([[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]], |[lo, hi], p| {
-        [0, 1].map(|side| std::array::from_fn(|k| if side == 0 { lo[k].min(p[k]) } else { hi[k].max(p[k]) }))
-    });
     let mut attributes = BTreeMap::new();
     let mut written = vec![
-        (
-            json::mesh::Semantic::Positions,
-            little_endian(&positions),
-            Type::Vec3,
-            Some(bounds.map(|b| json!(b))),
-            "positions",
-        ),
+        (json::mesh::Semantic::Positions, little_endian(&positions), Type::Vec3, Some(bounds(&positions)), "positions"),
         (json::mesh::Semantic::Normals, little_endian(&normals), Type::Vec3, None, "normals"),
         (json::mesh::Semantic::TexCoords(0), single(surface.uv()), Type::Vec2, None, "uv"),
     ];
@@ -131,13 +145,12 @@ pub fn to_glb(surface: &Surface, report: &Value, provenance: &Value) -> Vec<u8> 
             ..Default::default()
         },
         buffers: vec![json::Buffer {
-            byte_length: USize64::from(buffer.bytes.len()),
+            byte_length: USize64(0),
             name: None,
             uri: None,
             extensions: None,
             extras: Default::default(),
         }],
-        buffer_views: buffer.views,
         extras: serde_json::value::to_raw_value(&json!({ "report": report, "provenance": provenance })).ok(),
         images: vec![json::Image {
             buffer_view: Some(image),
@@ -187,7 +200,7 @@ pub fn to_glb(surface: &Surface, report: &Value, provenance: &Value) -> Vec<u8> 
         }],
         ..Default::default()
     };
-    container(root.to_vec().expect("glTF of plain values is always JSON"), buffer.bytes)
+    (root, buffer)
 }
 
 fn material() -> json::Material {

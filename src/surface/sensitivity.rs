@@ -223,6 +223,15 @@ impl Welded {
     }
 }
 
+/// Whether a file holds a gradient at all: the tensor `gradient` with rows of three finite numbers. The error is a sentence.
+pub fn check_gradient(bytes: &[u8]) -> Result<(), String> {
+    let tensors = SafeTensors::deserialize(bytes).map_err(|e| e.to_string())?;
+    match floats(&tensors, "gradient")?.0.last() {
+        Some(3) => Ok(()),
+        _ => Err("\"gradient\" has no rows of three numbers".to_owned()),
+    }
+}
+
 /// The shape and the numbers of a tensor, all of them finite.
 fn floats(tensors: &SafeTensors<'_>, name: &str) -> Result<(Vec<usize>, Vec<f64>), String> {
     let tensor = tensors.tensor(name).map_err(|_| {

@@ -22,6 +22,10 @@
 //! The metadata has one entry, `shrinkd`: JSON with `format`, `version`, `lattice`, `rows`, `columns`, `vertices` and
 //! `coordinates` (what the forms are taken by). The same surface gives the same bytes.
 
+mod read;
+
+pub use read::{Unreadable, from_safetensors};
+
 use super::Surface;
 use super::forms::forms;
 use crate::shrink::lattice::LatticeSpec;
@@ -137,5 +141,43 @@ mod tests {
         let data = file.tensor("positions").unwrap().data().to_vec();
         let z = f32::from_le_bytes(data[data.len() - 4..].try_into().unwrap());
         assert_eq!(z, -0.5);
+    }
+
+    #[test]
+    fn a_surface_is_read_back_with_its_diagonals() {
+        for spec in [LatticeSpec::Latlong { n_theta: 12, n_phi: 6 }, LatticeSpec::Octahedral { n: 3 }] {
+            let mut surface = sphere_surface(spec, 0.5);
+            let mut diagonals = vec![false; surface.lattice.quads.len()];
+            for i in (0..diagonals.len()).step_by(3) {
+                diagonals[i] = surface.lattice.free[i];
+            }
+            surface.triangles = surface.lattice.triangles(&diagonals);
+            let read = from_safetensors(&to_safetensors(&surface), spec).expect("reads");
+            assert_eq!(read, surface.earlier());
+            assert!(diagonals.contains(&true) && read.diagonals == diagonals);
+        }
+    }
+
+    #[test]
+    fn what_is_no_surface_on_the_lattice_is_refused_by_what_is_wrong() {
+        let spec = LatticeSpec::Latlong { n_theta: 12, n_phi: 6 };
+        let mut surface = sphere_surface(spec, 0.5);
+        let good = to_safetensors(&surface);
+        let refusal = |bytes: &[u8], spec| from_safetensors(bytes, spec).expect_err("is refused").to_string();
+        for cut in [0, 7, 8, 100, good.len() - 1] {
+            assert!(refusal(&good[..cut], spec).contains("no safetensors"), "{cut}");
+        }
+        let huge = [u64::MAX.to_le_bytes().as_slice(), b"{}"].concat();
+        assert!(refusal(&huge, spec).contains("no safetensors"));
+        assert!(refusal(&good, LatticeSpec::Octahedral { n: 3 }).contains("on the lattice {\"latlong\""));
+        let weights = file(&[("positions", Dtype::F32, vec![1], vec![0; 4])], &json!({"format": FORMAT}));
+        assert!(refusal(&weights, spec).contains("metadata"));
+        surface.triangles.swap(0, 1);
+        assert!(refusal(&to_safetensors(&surface), spec).contains("triangles"));
+        surface.triangles.swap(0, 1);
+        for wrong in [f32::NAN, f32::INFINITY, 1e7] {
+            surface.positions[5][1] = wrong;
+            assert!(refusal(&to_safetensors(&surface), spec).contains("of positions is"), "{wrong}");
+        }
     }
 }

@@ -16,4 +16,5 @@ mod refusals;
 mod relaxed;
 mod sensitivity;
 mod walk;
+mod warm;
 mod weight;

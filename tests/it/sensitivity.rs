@@ -1,6 +1,8 @@
 //! How a surface moves with its network, held against surfaces that were extracted again.
 
-use crate::app::BINARY;
+use crate::app::{App, BINARY, endless, state};
+use reqwest::{Method, Response, StatusCode};
+use serde_json::{Value, json};
 use shrinkd::field::network::safetensors as own;
 use shrinkd::surface::sensitivity::Welded;
 use std::path::Path;
@@ -174,4 +176,99 @@ fn files_that_do_not_fit_are_refused_by_name() {
     let scene = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/scenes/fork.json");
     let said = refused(scene, &place("s"), &place("short"));
     assert!(said.contains("only a network has weights and codes"), "{said}");
+}
+
+async fn input(app: &App, bytes: Vec<u8>) -> Value {
+    let response = app.request(Method::POST, "/v1/inputs").body(bytes).send().await.expect("an answer");
+    response.json::<Value>().await.expect("JSON")["id"].clone()
+}
+
+async fn asked(app: &App, job: &str, gradient: Vec<u8>, key: &str) -> Response {
+    let request = app.request(Method::POST, &format!("/v1/jobs/{job}/sensitivity")).header("Idempotency-Key", key);
+    request.body(gradient).send().await.expect("an answer")
+}
+
+#[tokio::test]
+async fn a_job_is_differentiated_also_when_it_is_forgotten_before() {
+    let folder = tempfile::tempdir().expect("folder");
+    let place = |name: &str| folder.path().join(name);
+    let app = App::start_with(&place("data"), &[("SHRINKD_WORKER__SLOTS", "1")]);
+    let net = input(&app, std::fs::read(NET).expect("there")).await;
+    let field = json!({"input": net, "latent_row": 0});
+    let shrink = json!({"lattice": {"octahedral": {"n": 16}}});
+    let id = app.submit(&json!({"field": field, "shrink": shrink, "outputs": ["surface"]})).await;
+    let job = app.ended(&id).await;
+    assert_eq!(state(&job), "succeeded", "{job}");
+    let bytes = app.get(&format!("/v1/jobs/{id}/outputs/surface")).await.bytes().await.expect("bytes");
+    std::fs::write(place("s"), &bytes).expect("writes");
+    let made = surface(&place("s"));
+    write_gradient(&place("g"), &loss(&made, [0.0; 3]).1);
+    let gradient = std::fs::read(place("g")).expect("written");
+
+    // one worker, and it is busy: the surface is gone from its job before it is needed
+    let busy = app.submit(&endless()).await;
+    app.running(&busy).await;
+    let response = asked(&app, &id, gradient.clone(), "once").await;
+    assert_eq!(response.status(), StatusCode::ACCEPTED);
+    let accepted: Value = response.json().await.expect("JSON");
+    assert_eq!((&accepted["kind"], &accepted["of"]), (&json!("sensitivity"), &json!(id)));
+    let forgotten = app.request(Method::DELETE, &format!("/v1/jobs/{id}")).send().await.expect("an answer");
+    assert_eq!(forgotten.status(), StatusCode::NO_CONTENT);
+    let again = asked(&app, &id, gradient.clone(), "once").await;
+    assert_eq!(again.headers()["idempotent-replayed"], "true");
+    app.post(&format!("/v1/jobs/{busy}/cancel"), &json!({})).await;
+    let ended = app.ended(accepted["id"].as_str().expect("a name")).await;
+    assert_eq!(state(&ended), "succeeded", "{ended}");
+    let href = ended["outputs"][0]["href"].as_str().expect("a place").to_owned();
+    assert!(href.ends_with("/outputs/sensitivity"), "{ended}");
+    let served = app.get(&href).await.bytes().await.expect("bytes");
+
+    // the command line makes the same bytes
+    let arguments =
+        ["--latent-row", "0", "--surface", text(&place("s")), "--gradient", text(&place("g")), "-o", text(&place("d"))]
+            .map(str::to_owned);
+    run(&[&["sensitivity", NET][..], &arguments.iter().map(String::as_str).collect::<Vec<_>>()].concat());
+    assert!(std::fs::read(place("d")).expect("written") == served);
+}
+
+#[tokio::test]
+async fn what_cannot_be_differentiated_is_refused() {
+    let folder = tempfile::tempdir().expect("folder");
+    let place = |name: &str| folder.path().join(name);
+    let app = App::start(&place("data"));
+    write_gradient(&place("g"), &[[1.0; 3]; 4]);
+    let gradient = std::fs::read(place("g")).expect("written");
+    let refused = async |job: &str, gradient: Vec<u8>, key: &str, status: StatusCode| {
+        let response = asked(&app, job, gradient, key).await;
+        assert_eq!(response.status(), status);
+        response.json::<Value>().await.expect("JSON")
+    };
+    let scene = json!({"field": {"scene": {"sphere": {"radius": 0.5}}}, "shrink": {"lattice": {"octahedral": {"n": 8}}},
+                       "outputs": ["surface"]});
+    let scene = app.submit(&scene).await;
+    app.ended(&scene).await;
+    let problem = refused(&scene, gradient.clone(), "a", StatusCode::CONFLICT).await;
+    assert_eq!(problem["code"], "not_differentiable");
+    assert!(problem["detail"].as_str().is_some_and(|detail| detail.ends_with("is of a scene, which has no weights")));
+    let problem = refused(&scene, b"{}".to_vec(), "b", StatusCode::UNPROCESSABLE_ENTITY).await;
+    assert_eq!(problem["code"], "malformed_gradient");
+    let nobody = "01890000-0000-7000-8000-000000000000";
+    refused(nobody, gradient.clone(), "c", StatusCode::NOT_FOUND).await;
+
+    let net = input(&app, std::fs::read(NET).expect("there")).await;
+    let field = json!({"input": net, "latent_row": 0});
+    let shrink = json!({"lattice": {"octahedral": {"n": 8}}});
+    let plain = app.submit(&json!({"field": field, "shrink": shrink, "outputs": ["report"]})).await;
+    app.ended(&plain).await;
+    let problem = refused(&plain, gradient.clone(), "d", StatusCode::CONFLICT).await;
+    assert!(problem["detail"].as_str().is_some_and(|detail| detail.contains("output \"surface\"")), "{problem}");
+    let full = app.submit(&json!({"field": field, "shrink": shrink, "outputs": ["surface"]})).await;
+    app.ended(&full).await;
+    // of the wrong shape, which only the worker knows
+    let accepted: Value = asked(&app, &full, gradient, "e").await.json().await.expect("JSON");
+    let ended = app.ended(accepted["id"].as_str().expect("a name")).await;
+    assert_eq!((state(&ended), &ended["problem"]["code"]), ("failed", &json!("malformed_gradient")));
+
+    let direct = app.post("/v1/jobs", &json!({"kind": "sensitivity"})).await;
+    assert_eq!(direct.status(), StatusCode::UNPROCESSABLE_ENTITY);
 }

@@ -87,6 +87,7 @@ fn job_of(row: &Row<'_>) -> rusqlite::Result<Job> {
         labels: from_json(&row.get::<_, String>(7)?)?,
         shrink: (kind == JobKind::Shrink).then(|| from_json(&settings)).transpose()?,
         fit: (kind == JobKind::Fit).then(|| from_json(&settings)).transpose()?,
+        of: (kind == JobKind::Sensitivity).then(|| from_json(&settings)).transpose()?,
         eta_s: progress.as_ref().and_then(|p| p.eta_s).filter(|_| !state.ended()),
         progress,
         metrics: json(10)?.as_deref().map(from_json).transpose()?,
@@ -100,22 +101,46 @@ pub(super) fn read(connection: &Connection, id: JobId) -> rusqlite::Result<Optio
     connection.prepare_cached(&query)?.query_row([id.to_string()], job_of).optional()
 }
 
+/// The request of a job, as it was stored.
+pub(super) fn spec(connection: &Connection, id: JobId) -> rusqlite::Result<Option<serde_json::Value>> {
+    let query = "SELECT spec FROM jobs WHERE id = ?1";
+    let text =
+        connection.prepare_cached(query)?.query_row([id.to_string()], |row| row.get::<_, String>(0)).optional()?;
+    text.as_deref().map(from_json).transpose()
+}
+
 pub(super) fn insert(ctx: &mut Ctx<'_>, new: &NewJob) -> rusqlite::Result<()> {
     let (id, spec) = (new.id.to_string(), &new.spec);
     let settings = match &spec.work {
         Work::Shrink(shrinking) => to_json(&shrinking.shrink)?,
         Work::Fit(fitting) => to_json(&fitting.fit)?,
+        Work::Sensitivity(sensing) => to_json(&sensing.of)?,
     };
     ctx.connection.execute(
         "INSERT INTO jobs (id, state, created_at, spec, labels, kind, settings)
          VALUES (?1, 'queued', ?2, ?3, ?4, ?5, ?6)",
         params![id, ctx.now, to_json(spec)?, to_json(&spec.labels)?, spec.work.kind().name(), settings],
     )?;
+    for (name, blob) in spec.work.held() {
+        name_blob(ctx.connection, new.id, name, &blob.hex())?;
+    }
     for (name, value) in &spec.labels {
         let label = "INSERT INTO labels (job, name, value) VALUES (?1, ?2, ?3)";
         ctx.connection.execute(label, params![id, name, value])?;
     }
     tell_state(ctx, new.id)
+}
+
+/// Notes that a job names a blob, so that the blob is kept while the job is.
+fn name_blob(connection: &Connection, job: JobId, name: &str, sha256: &str) -> rusqlite::Result<()> {
+    let named = "INSERT INTO outputs (job, name, sha256) VALUES (?1, ?2, ?3)";
+    connection.execute(named, params![job.to_string(), name, sha256]).map(|_| ())
+}
+
+/// The blobs that a job names, each once.
+pub(super) fn named_blobs(connection: &Connection, job: JobId) -> rusqlite::Result<Vec<String>> {
+    let mut named = connection.prepare_cached("SELECT DISTINCT sha256 FROM outputs WHERE job = ?1 ORDER BY name")?;
+    named.query_map([job.to_string()], |row| row.get(0))?.collect()
 }
 
 pub(super) fn list(connection: &Connection, query: &ListQuery) -> rusqlite::Result<Page> {
@@ -172,8 +197,7 @@ pub(super) fn change(ctx: &mut Ctx<'_>, id: JobId, change: Change) -> rusqlite::
         ],
     )?;
     for output in change.outputs.iter().flatten() {
-        let named = "INSERT INTO outputs (job, name, sha256) VALUES (?1, ?2, ?3)";
-        ctx.connection.execute(named, params![id.to_string(), output.name, output.sha256])?;
+        name_blob(ctx.connection, id, &output.name, &output.sha256)?;
     }
     tell_state(ctx, id)?;
     if change.state.ended() {

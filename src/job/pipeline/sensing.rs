@@ -1,10 +1,13 @@
 //! From a gradient of a surface's vertices to one of its network: the part of the pipeline that differentiates.
 
+use super::{Finished, pretty};
 use crate::field::input::{self, FieldOptions};
 use crate::job::failure::{Ended, Failure};
+use crate::job::spec::OutputName;
 use crate::settings::Settings;
 use crate::surface::sensitivity::{Welded, sensitivity, to_safetensors};
 use serde::{Deserialize, Serialize};
+use serde_json::json;
 
 /// What there is to say about derivatives.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -25,6 +28,25 @@ pub struct Carried {
     pub bytes: Vec<u8>,
     /// What there is to say about it.
     pub report: SensitivityReport,
+}
+
+/// Carries a gradient back as a job does: `blobs` are the network, the surface and the gradient.
+pub fn run_sensitivity(
+    options: &FieldOptions,
+    blobs: &[impl AsRef<[u8]>],
+    outputs: &[OutputName],
+    settings: &Settings<'_>,
+) -> Result<Finished, Ended> {
+    let [field, surface, gradient] = blobs else { return Err(Failure::internal().into()) };
+    let made = sensitivity_of(field.as_ref(), options, surface.as_ref(), gradient.as_ref(), settings)?;
+    let files = outputs.iter().map(|&output| {
+        let bytes = match output {
+            OutputName::Sensitivity => made.bytes.clone(),
+            _ => pretty(&made.report),
+        };
+        (output, bytes)
+    });
+    Ok(Finished { metrics: json!(made.report), certified: true, files: files.collect(), problem: None })
 }
 
 /// Carries the gradient in `gradient` from the vertices in `surface` to the network in `field`.

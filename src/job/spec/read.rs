@@ -1,8 +1,8 @@
 //! Reads a request, member by member, and collects its faults.
 
 use super::{
-    FieldSpec, Fitting, JobSpec, MAX_LABEL_NAME, MAX_LABEL_VALUE, MAX_LABELS, MAX_LATENT, OutputName, SAMPLES,
-    Shrinking, Work, check_lattice,
+    FieldSpec, Fitting, JobSpec, MAX_LABEL_NAME, MAX_LABEL_VALUE, MAX_LABELS, MAX_LATENT, OutputName, SAMPLES, Sensing,
+    Shrinking, WarmStartSpec, Work, check_lattice,
 };
 use crate::blobs::BlobId;
 use crate::extract::Budget;
@@ -104,6 +104,11 @@ pub fn read_spec(value: &Value, faults: &mut Faults) -> JobSpec {
             vec![OutputName::Glb, OutputName::Preview, OutputName::Report],
         ),
         JobKind::Fit => (Work::Fit(read_fitting(value, faults)), vec![OutputName::Network, OutputName::Report]),
+        JobKind::Sensitivity => match read_sensing(value, faults) {
+            Some(work) => (Work::Sensitivity(Box::new(work)), OutputName::of(kind).to_vec()),
+            // with a fault, so that nothing comes of it
+            None => (Work::Fit(Fitting { meshes: Vec::new(), fit: FitSpec::default() }), Vec::new()),
+        },
     };
     let mut spec = JobSpec { work, outputs, labels: BTreeMap::new() };
     if let Some(outputs) = value.get("outputs") {
@@ -113,6 +118,20 @@ pub fn read_spec(value: &Value, faults: &mut Faults) -> JobSpec {
         spec.labels = read_labels(labels, faults);
     }
     spec
+}
+
+/// Reads what the engine stored of a sensitivity.
+fn read_sensing(value: &Value, faults: &mut Faults) -> Option<Sensing> {
+    let object = faults.object(value, "", &["kind", "of", "field", "surface", "gradient", "outputs", "labels"])?;
+    let field = object.get("field").map(|field| read_field(field, "/field", faults));
+    let mut blob = |name: &str| object.get(name).and_then(|id| read_input(id, &format!("/{name}"), faults));
+    let (surface, gradient) = (blob("surface"), blob("gradient"));
+    let of = object.get("of").and_then(Value::as_str).and_then(|id| id.parse().ok());
+    let sensing = (|| Some(Sensing { of: of?, field: field?, surface: surface?, gradient: gradient? }))();
+    if sensing.is_none() {
+        faults.add("/kind", "not_offered", "a sensitivity is asked for by POST /v1/jobs/{id}/sensitivity");
+    }
+    sensing
 }
 
 /// Reads what a fit is of.
@@ -185,10 +204,11 @@ fn read_shrinking(value: &Value, faults: &mut Faults) -> Shrinking {
     let mut spec = Shrinking {
         field: FieldSpec::default(),
         weight: None,
+        warm_start: None,
         shrink: ShrinkSpec::default(),
         budget: Budget::default(),
     };
-    let known = ["kind", "field", "weight", "shrink", "budget", "outputs", "labels"];
+    let known = ["kind", "field", "weight", "warm_start", "shrink", "budget", "outputs", "labels"];
     let Some(object) = faults.object(value, "", &known) else { return spec };
     match object.get("field") {
         Some(field) => spec.field = read_field(field, "/field", faults),
@@ -210,10 +230,35 @@ fn read_shrinking(value: &Value, faults: &mut Faults) -> Shrinking {
         }
         _ => {}
     }
+    if let Some(warm_start) = object.get("warm_start") {
+        spec.warm_start = read_warm_start(warm_start, faults);
+        if spec.shrink.method != Method::Adaptive {
+            faults.add("/warm_start", "not_offered", "a warm start is made by the method adaptive");
+        }
+    }
     if let Some(budget) = object.get("budget") {
         spec.budget = read_budget(budget, faults);
     }
     spec
+}
+
+/// Reads a warm start: a job's name from a client, or what the engine stored of it.
+fn read_warm_start(value: &Value, faults: &mut Faults) -> Option<WarmStartSpec> {
+    const POINTER: &str = "/warm_start";
+    let (job, surface) = match value {
+        Value::Object(_) => {
+            let object = faults.object(value, POINTER, &["job", "surface"])?;
+            let surface = option(object, POINTER, "surface", "the name of a blob", faults)?;
+            (object.get("job").unwrap_or(&Value::Null), Some(surface))
+        }
+        name => (name, None),
+    };
+    let job = faults.string(job, POINTER)?;
+    let parsed = job.parse().ok();
+    if parsed.is_none() {
+        faults.add(POINTER, "invalid_id", "expected the id of a job");
+    }
+    Some(WarmStartSpec { job: parsed?, surface })
 }
 
 /// Reads a field, or a weight, at `pointer`.
