@@ -126,6 +126,9 @@ pub struct ExtractArgs {
     /// Where positions, normals, UVs and fundamental forms go (safetensors)
     #[arg(long, value_name = "S.safetensors")]
     pub surface: Option<PathBuf>,
+    /// Write into --surface how the surface moves with the network's latent code: dv/dz is the normal times this
+    #[arg(long, requires = "surface")]
+    pub latent_motion: bool,
     /// Where the curve of a 2-D scene goes (SVG) [default: beside the GLB]
     #[arg(long, value_name = "C.svg")]
     pub svg: Option<PathBuf>,

@@ -30,6 +30,9 @@ fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
     let spec = FieldSpec { options: args.field_options.read()?, ..FieldSpec::default() };
     let in_field = |detail: &str| format!("{}: {detail}", args.field.display());
     let mut opened = open(&args.field, |bytes| pipeline::open(&spec, Some(bytes), ""))?;
+    if args.latent_motion {
+        opened = open(&args.field, |bytes| opened.with_latent_motion(bytes, &spec.options))?;
+    }
     if let Some(path) = &args.weight {
         opened = open(path, |bytes| opened.with_weight(&FieldSpec::default(), Some(bytes), ""))?;
     }

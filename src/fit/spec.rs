@@ -61,7 +61,7 @@ impl Default for FitSpec {
             width: 128,
             activation: None,
             latent_size: 32,
-            epochs: 40,
+            epochs: 25,
             samples: 200_000,
             sampling: Sampling::Points,
             batch: 6144,

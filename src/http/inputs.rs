@@ -28,6 +28,11 @@ pub struct Input {
 }
 
 impl Input {
+    /// Whether it is a network that takes a latent code.
+    pub(super) fn has_latent_code(&self) -> bool {
+        matches!(self.description, Description::Network { latent_size, .. } if latent_size > 0)
+    }
+
     /// Whether it is a mesh.
     pub(super) fn is_mesh(&self) -> bool {
         matches!(self.description, Description::Mesh { .. })

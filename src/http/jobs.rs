@@ -323,6 +323,17 @@ async fn check_fields(app: &App, spec: &JobSpec) -> Result<u8, Problem> {
         Work::Sensitivity(_) => return Ok(3),
     };
     let dimension = check_field(app, &work.field, "/field").await?;
+    if work.latent_motion {
+        let input = match work.field.input {
+            Some(id) => Some(described(app, id, "/field/input").await?),
+            None => None,
+        };
+        if !input.is_some_and(|input| input.has_latent_code()) {
+            let detail = "only the surface of a network with a latent code moves with it".to_owned();
+            let fault = Fault { pointer: "/latent_motion".to_owned(), code: "no_latent_code", detail };
+            return Err(Problem::invalid_request("", &[fault]));
+        }
+    }
     if let Some(weight) = &work.weight
         && check_field(app, weight, "/weight").await? != 3
     {
@@ -472,6 +483,9 @@ pub struct ShrinkRequest {
     /// What samples are spread by, where the density is `weight`: its values, which need not be distances.
     #[schema(required = false)]
     weight: Option<FieldSpec>,
+    /// Whether the output `surface` says how the surface moves with the latent code (its tensor `latent_motion`).
+    #[schema(required = false)]
+    latent_motion: bool,
     /// The job whose output `surface` it begins from, and keeps the UVs of: one that succeeded by the method `adaptive` on the
     /// same lattice, of a field nearby.
     #[schema(required = false)]

@@ -12,7 +12,7 @@ use super::failure::{Ended, Failure};
 use super::spec::{FieldSpec, OutputName};
 use crate::blobs::BlobId;
 use crate::extract::{Budget, Extracted, Part, extract};
-use crate::field::input::{self, Description};
+use crate::field::input::{self, Description, FieldOptions, Placed};
 use crate::field::network::family::Detected;
 use crate::field::sampler::Tally;
 use crate::field::scene::Scene;
@@ -23,6 +23,7 @@ use crate::shrink::lattice::LatticeSpec;
 use crate::shrink::warm::Earlier;
 use crate::shrink::{Method, ShrinkError, ShrinkSpec};
 use crate::surface;
+use crate::surface::sensitivity::latent_motion;
 use serde::Serialize;
 use serde_json::{Value, json};
 use std::cell::Cell;
@@ -46,6 +47,8 @@ pub struct Opened {
     pub provenance: Value,
     /// What a network's file was taken for.
     pub detected: Option<Detected>,
+    /// The network, where the surface is to say how it moves with its latent code.
+    pub moved_by: Option<Placed>,
 }
 
 /// What a job made.
@@ -153,7 +156,7 @@ pub fn open(spec: &FieldSpec, bytes: Option<&[u8]>, at: &str) -> Result<Opened, 
         input::open(bytes, &spec.options).map_err(|e| Failure::from_field(&e, at))?;
     // the bytes of a scene in a request are its JSON without spaces, members in alphabetical order
     let provenance = json!({"sha256": BlobId::of(bytes).hex(), "bytes": bytes.len(), "options": spec.options});
-    Ok(Opened { field, weight: None, earlier: None, provenance, detected })
+    Ok(Opened { field, weight: None, earlier: None, provenance, detected, moved_by: None })
 }
 
 impl Opened {
@@ -169,6 +172,17 @@ impl Opened {
         }
         self.weight = Some(opened.field);
         self.provenance["weight"] = opened.provenance;
+        Ok(self)
+    }
+
+    /// The same with the network in `bytes`, so that the output `surface` says how it moves with its latent code.
+    pub fn with_latent_motion(mut self, bytes: &[u8], options: &FieldOptions) -> Result<Self, Box<Failure>> {
+        let (placed, _) = input::open_network(bytes, options).map_err(|e| Failure::from_field(&e, "/field"))?;
+        if placed.latent.is_empty() {
+            let detail = "the network takes no latent code, so nothing moves with it".to_owned();
+            return Err(Box::new(Failure::from_field(&FieldError::Unsupported { detail }, "/field")));
+        }
+        self.moved_by = Some(placed);
         Ok(self)
     }
 
@@ -234,7 +248,10 @@ pub fn make(opened: &Opened, asked: &Asked<'_>, settings: Settings<'_>) -> Resul
     let files = asked.written(&settings, |output| {
         Ok(match output {
             OutputName::Glb => surface::gltf::to_glb(&surface, &lasting, &opened.provenance),
-            OutputName::Surface => surface::tensors::to_safetensors(&surface),
+            OutputName::Surface => {
+                let motion = opened.moved_by.as_ref().map(|net| latent_motion(net, &surface.positions, &settings));
+                surface::tensors::to_safetensors(&surface, motion.transpose()?.as_deref())
+            }
             OutputName::Svg | OutputName::Network | OutputName::Sensitivity => {
                 let detail = format!("{} is not made of a field of dimension 3", output.name());
                 return Err(Failure::new("dimension", "the field has the wrong dimension for this", detail).into());

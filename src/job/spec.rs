@@ -266,6 +266,9 @@ pub struct Shrinking {
     /// The surface that it begins from.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub warm_start: Option<WarmStartSpec>,
+    /// Whether the output `surface` says how the surface moves with the latent code.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub latent_motion: bool,
     /// How it is shrunk.
     pub shrink: ShrinkSpec,
     /// What may be spent on it.

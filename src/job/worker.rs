@@ -205,7 +205,11 @@ impl Worker {
                     Work::Shrink(work) => {
                         let mut inputs = inputs.iter();
                         let mut next = |field: &FieldSpec| field.input.and_then(|_| inputs.next()).map(Bytes::as_ref);
-                        let mut opened = pipeline::open(&work.field, next(&work.field), "/field")?;
+                        let field = next(&work.field);
+                        let mut opened = pipeline::open(&work.field, field, "/field")?;
+                        if let Some(bytes) = field.filter(|_| work.latent_motion) {
+                            opened = opened.with_latent_motion(bytes, &work.field.options)?;
+                        }
                         if let Some(weight) = &work.weight {
                             opened = opened.with_weight(weight, next(weight), "/weight")?;
                         }

@@ -19,6 +19,12 @@
 //! | `chart_vertex` | \[m\] | u32, the welded vertex of each |
 //! | `chart_triangles` | [n, 3] | u32, chart vertices, in the order of `triangles` |
 //!
+//! A surface of a network with a latent code has one more on request:
+//!
+//! | tensor | shape | type |
+//! |---|---|---|
+//! | `latent_motion` | [rows, columns, size of the code] | f32, scene units: dv/dz is the normal times this |
+//!
 //! The metadata has one entry, `shrinkd`: JSON with `format`, `version`, `lattice`, `rows`, `columns`, `vertices` and
 //! `coordinates` (what the forms are taken by). The same surface gives the same bytes.
 
@@ -36,8 +42,9 @@ use std::collections::HashMap;
 /// Version of the layout above.
 const FORMAT: u32 = 1;
 
-/// The surface as a safetensors file.
-pub fn to_safetensors(surface: &Surface) -> Vec<u8> {
+/// The surface as a safetensors file. `latent_motion` has a row of every vertex, see
+/// [`latent_motion`](super::sensitivity::latent_motion).
+pub fn to_safetensors(surface: &Surface, latent_motion: Option<&[f32]>) -> Vec<u8> {
     let lattice = &surface.lattice;
     let (rows, columns) = (lattice.rows, lattice.columns);
     let forms = forms(surface);
@@ -76,6 +83,12 @@ pub fn to_safetensors(surface: &Surface) -> Vec<u8> {
         tensors.push(("chart_vertex", Dtype::U32, vec![uv.len()], whole(&mut lattice.chart.iter().copied())));
         let corners = whole(&mut triangles.iter().flatten().copied());
         tensors.push(("chart_triangles", Dtype::U32, vec![triangles.len(), 3], corners));
+    }
+    if let Some(motion) = latent_motion {
+        let size = motion.len() / surface.positions.len().max(1);
+        let row = |&v: &u32| &motion[v as usize * size..][..size];
+        let data = lattice.grid.iter().flat_map(row).flat_map(|z| z.to_le_bytes()).collect();
+        tensors.push(("latent_motion", Dtype::F32, vec![rows, columns, size], data));
     }
     let about = json!({
         "format": FORMAT,
@@ -117,8 +130,8 @@ mod tests {
     #[test]
     fn every_tensor_is_there_in_its_shape_and_the_bytes_do_not_change() {
         let surface = sphere_surface(LatticeSpec::Latlong { n_theta: 12, n_phi: 6 }, 0.5);
-        let bytes = to_safetensors(&surface);
-        assert_eq!(bytes, to_safetensors(&surface));
+        let bytes = to_safetensors(&surface, None);
+        assert_eq!(bytes, to_safetensors(&surface, None));
         let file = SafeTensors::deserialize(&bytes).unwrap();
         for (name, shape) in [
             ("positions", vec![7, 13, 3]),
@@ -152,7 +165,7 @@ mod tests {
                 diagonals[i] = surface.lattice.free[i];
             }
             surface.triangles = surface.lattice.triangles(&diagonals);
-            let read = from_safetensors(&to_safetensors(&surface), spec).expect("reads");
+            let read = from_safetensors(&to_safetensors(&surface, None), spec).expect("reads");
             assert_eq!(read, surface.earlier());
             assert!(diagonals.contains(&true) && read.diagonals == diagonals);
         }
@@ -162,7 +175,7 @@ mod tests {
     fn what_is_no_surface_on_the_lattice_is_refused_by_what_is_wrong() {
         let spec = LatticeSpec::Latlong { n_theta: 12, n_phi: 6 };
         let mut surface = sphere_surface(spec, 0.5);
-        let good = to_safetensors(&surface);
+        let good = to_safetensors(&surface, None);
         let refusal = |bytes: &[u8], spec| from_safetensors(bytes, spec).expect_err("is refused").to_string();
         for cut in [0, 7, 8, 100, good.len() - 1] {
             assert!(refusal(&good[..cut], spec).contains("no safetensors"), "{cut}");
@@ -173,11 +186,11 @@ mod tests {
         let weights = file(&[("positions", Dtype::F32, vec![1], vec![0; 4])], &json!({"format": FORMAT}));
         assert!(refusal(&weights, spec).contains("metadata"));
         surface.triangles.swap(0, 1);
-        assert!(refusal(&to_safetensors(&surface), spec).contains("triangles"));
+        assert!(refusal(&to_safetensors(&surface, None), spec).contains("triangles"));
         surface.triangles.swap(0, 1);
         for wrong in [f32::NAN, f32::INFINITY, 1e7] {
             surface.positions[5][1] = wrong;
-            assert!(refusal(&to_safetensors(&surface), spec).contains("of positions is"), "{wrong}");
+            assert!(refusal(&to_safetensors(&surface, None), spec).contains("of positions is"), "{wrong}");
         }
     }
 }

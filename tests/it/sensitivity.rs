@@ -272,3 +272,56 @@ async fn what_cannot_be_differentiated_is_refused() {
     let direct = app.post("/v1/jobs", &json!({"kind": "sensitivity"})).await;
     assert_eq!(direct.status(), StatusCode::UNPROCESSABLE_ENTITY);
 }
+
+/// The example in the repository; needs Python, whose absence is said.
+#[tokio::test]
+async fn a_latent_code_is_changed_until_the_surface_meets_a_target() {
+    let folder = tempfile::tempdir().expect("folder");
+    let app = App::start(folder.path());
+    let example = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/optimize_latent.py");
+    let mut command = Command::new("python3");
+    command.args([example, &app.url, NET, "--row", "3", "--volume", "0.4"]);
+    let said = match tokio::task::spawn_blocking(move || command.output()).await.expect("ends") {
+        Ok(said) => said,
+        Err(error) => {
+            eprintln!("skipped: python3 cannot be run: {error}");
+            return;
+        }
+    };
+    let out = String::from_utf8_lossy(&said.stdout).into_owned();
+    assert!(said.status.success(), "{out}{}", String::from_utf8_lossy(&said.stderr));
+    assert!(out.lines().count() > 1, "it began elsewhere: {out}");
+}
+
+/// The volume's slope by the code is the motion along the normals, summed over areas.
+#[test]
+fn the_surface_says_how_it_moves_with_its_code() {
+    let folder = tempfile::tempdir().expect("folder");
+    let place = |name: &str| folder.path().join(name);
+    let (glb, out) = (place("s.glb"), place("s"));
+    let extract =
+        ["extract", NET, "--latent-row", "0", "--lattice", "octahedral:32", "-o", text(&glb), "--surface", text(&out)];
+    run(&[&extract[..], &["--latent-motion"]].concat());
+    let made = surface(&out);
+    let (_, by_vertex) = loss(&made, [0.0; 3]);
+    let (normals, motion) = (numbers(&out, "normals"), numbers(&out, "latent_motion"));
+    let mut slope = [0.0; 2];
+    let mut seen = vec![false; by_vertex.len()];
+    for (point, &v) in made.0.vertex.iter().enumerate() {
+        if !std::mem::replace(&mut seen[v as usize], true) {
+            let outward: f64 = (0..3).map(|a| by_vertex[v as usize][a] * normals[3 * point + a]).sum();
+            (0..2).for_each(|k| slope[k] += outward * motion[2 * point + k]);
+        }
+    }
+    write_gradient(&place("g"), &by_vertex);
+    let arguments = ["sensitivity", NET, "--latent-row", "0", "--surface", text(&out), "--gradient"];
+    run(&[&arguments[..], &[text(&place("g")), "-o", text(&place("d"))]].concat());
+    for (found, expected) in slope.into_iter().zip(numbers(&place("d"), "latent")) {
+        assert!((found / expected - 1.0).abs() < 1e-4, "{found} {expected}");
+    }
+    let blob = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures/networks/blob.safetensors");
+    let refused = ["extract", blob, "-o", text(&glb), "--surface", text(&out), "--latent-motion"];
+    let said = Command::new(BINARY).args(refused).output().expect("runs");
+    assert_eq!(said.status.code(), Some(3));
+    assert!(String::from_utf8_lossy(&said.stderr).contains("takes no latent code"));
+}

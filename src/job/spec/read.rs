@@ -205,10 +205,11 @@ fn read_shrinking(value: &Value, faults: &mut Faults) -> Shrinking {
         field: FieldSpec::default(),
         weight: None,
         warm_start: None,
+        latent_motion: false,
         shrink: ShrinkSpec::default(),
         budget: Budget::default(),
     };
-    let known = ["kind", "field", "weight", "warm_start", "shrink", "budget", "outputs", "labels"];
+    let known = ["kind", "field", "weight", "warm_start", "latent_motion", "shrink", "budget", "outputs", "labels"];
     let Some(object) = faults.object(value, "", &known) else { return spec };
     match object.get("field") {
         Some(field) => spec.field = read_field(field, "/field", faults),
@@ -216,6 +217,14 @@ fn read_shrinking(value: &Value, faults: &mut Faults) -> Shrinking {
     }
     if let Some(shrink) = object.get("shrink") {
         spec.shrink = read_shrink(shrink, faults);
+    }
+    if let Some(wanted) = object.get("latent_motion") {
+        spec.latent_motion = faults.boolean(wanted, "/latent_motion").unwrap_or_default();
+        let outputs = object.get("outputs").and_then(Value::as_array);
+        let surface = outputs.is_some_and(|list| list.iter().any(|name| name == OutputName::Surface.name()));
+        if spec.latent_motion && !surface {
+            faults.add("/latent_motion", "no_surface", "it is written into the output surface, which is not asked for");
+        }
     }
     if let Some(weight) = object.get("weight") {
         spec.weight = Some(read_field(weight, "/weight", faults));
