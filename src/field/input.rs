@@ -121,12 +121,11 @@ pub fn open(bytes: &[u8], options: &FieldOptions) -> Result<Opened, FieldError> 
         }
         Format::Safetensors | Format::Npz | Format::Torch | Format::Folder | Format::Onnx => {
             refuse(std::mem::take(&mut faults))?;
-            let (mut network, detected) = network::read(bytes, format, options)?;
+            let (network, detected) = network::read(bytes, format, options, &mut faults)?;
             let latent = options.latent_of(&network, &mut faults);
             if options.domain == Some(DomainOption::Named(DomainName::Fit)) {
                 faults.push(options::fault("/domain", "not_offered", "a network's domain cannot be fitted"));
             }
-            network::overridden(&mut network, options, &mut faults);
             refuse(faults)?;
             let field = network
                 .field(&latent)
@@ -161,13 +160,22 @@ pub fn open(bytes: &[u8], options: &FieldOptions) -> Result<Opened, FieldError> 
     }
 }
 
-/// Says what the bytes hold, having read and checked them as [`open`] would.
+/// Says what the bytes hold, having read and checked them as [`open`] would. Of the options those count that say how to
+/// read a network: `family`, `encoding`, `activation`, `w0` and `skip`.
 ///
 /// # Errors
-/// As [`open`].
-pub fn describe(bytes: &[u8]) -> Result<Description, FieldError> {
+/// As [`open`]; with one of those options given, every [`FieldError::Invalid`] is about the options.
+pub fn describe(bytes: &[u8], options: &FieldOptions) -> Result<Description, FieldError> {
     let format = Format::detect(bytes)?;
     let name = format.name().to_owned();
+    let mut faults = options.faults();
+    match format {
+        Format::Scene => faults.extend(options.refuse_network_members("a scene")),
+        Format::Mesh(_) => faults.extend(options.refuse_network_members("a mesh")),
+        Format::Grid => faults.extend(options.refuse_network_members("a grid")),
+        _ => {}
+    }
+    refuse(std::mem::take(&mut faults))?;
     Ok(match format {
         Format::Scene => {
             let scene = scene_from_slice(bytes, None)?;
@@ -175,7 +183,8 @@ pub fn describe(bytes: &[u8]) -> Result<Description, FieldError> {
             Description::Scene { format: name, dimension, metric, domain }
         }
         Format::Safetensors | Format::Npz | Format::Torch | Format::Folder | Format::Onnx => {
-            let (network, detected) = network::read(bytes, format, &FieldOptions::default())?;
+            let (network, detected) = network::read(bytes, format, options, &mut faults)?;
+            refuse(faults)?;
             Description::Network {
                 format: name,
                 detected,

@@ -8,7 +8,7 @@ use super::failure::{Ended, Failure};
 use super::spec::{FieldSpec, OutputName};
 use crate::blobs::BlobId;
 use crate::extract::{Budget, Extracted, Part, extract};
-use crate::field::input::{self, Description};
+use crate::field::input::{self, Description, FieldOptions};
 use crate::field::network::family::Detected;
 use crate::field::sampler::Tally;
 use crate::field::scene::Scene;
@@ -124,9 +124,9 @@ pub fn check_scene(scene: &Value) -> Result<u8, FieldError> {
     Scene::from_value(scene).map(|scene| scene.dimension())
 }
 
-/// Tells what bytes are, without running them.
-pub fn describe(bytes: &[u8]) -> Result<Description, FieldError> {
-    input::describe(bytes)
+/// Tells what bytes are, read as the options say, without running them.
+pub fn describe(bytes: &[u8], options: &FieldOptions) -> Result<Description, FieldError> {
+    input::describe(bytes, options)
 }
 
 /// Opens the field of a request; `bytes` are those of the input that it names, if it names one. Faults are pointed to

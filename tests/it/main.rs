@@ -11,6 +11,7 @@ mod evaluate;
 mod faults;
 mod losses;
 mod metrics;
+mod reading;
 mod refusals;
 mod relaxed;
 mod walk;

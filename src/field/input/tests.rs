@@ -189,7 +189,7 @@ fn a_flat_scene_only_moves_in_its_plane() {
 
 #[test]
 fn files_are_described() {
-    let describe = |bytes: &[u8]| serde_json::to_value(describe(bytes).unwrap()).unwrap();
+    let describe = |bytes: &[u8]| serde_json::to_value(describe(bytes, &FieldOptions::default()).unwrap()).unwrap();
     let blob = describe(&fixture("blob.npz"));
     assert_eq!(blob["kind"], "network");
     assert_eq!(blob["format"], "npz");
@@ -230,10 +230,10 @@ fn files_that_are_not_read_are_refused_by_the_name_of_what_they_are() {
         (b"\x80\x04\x95".to_vec(), "pickle"),
     ];
     for (bytes, name) in cases {
-        let refusal = describe(&bytes).expect_err("no field").to_string();
+        let refusal = describe(&bytes, &FieldOptions::default()).expect_err("no field").to_string();
         assert!(refusal.contains(name), "{refusal}");
     }
     for bytes in [&b""[..], b"\0", b"<html></html>", b"hello", &[0xff; 300]] {
-        assert!(matches!(describe(bytes), Err(FieldError::Unrecognized { .. })), "{bytes:?}");
+        assert!(matches!(describe(bytes, &FieldOptions::default()), Err(FieldError::Unrecognized { .. })), "{bytes:?}");
     }
 }

@@ -57,9 +57,18 @@ pub struct Detected {
     pub family: Family,
     /// What in the file says so.
     pub because: String,
-    /// What the file does not say and was taken as is usual in the family; options override it.
+    /// What neither the file nor an option says and was taken as is usual in the family. What an option overrides ends with
+    /// its name in parentheses.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub assumed: Vec<String>,
+}
+
+impl Detected {
+    /// Forgets what was assumed in the place of an option that is given.
+    pub(in crate::field) fn no_longer_assumes(&mut self, option: &str) {
+        let ending = format!("(`{option}`)");
+        self.assumed.retain(|assumption| !assumption.ends_with(&ending));
+    }
 }
 
 /// What a `specs.json` of DeepSDF says about the network.

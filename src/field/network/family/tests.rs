@@ -77,7 +77,11 @@ fn every_family_is_told_and_agrees_with_pytorch_in_value_and_gradient() {
 #[test]
 fn a_description_names_the_family_and_what_was_assumed() {
     let bytes = std::fs::read(committed().join("siren.pth")).unwrap();
-    let Description::Network { format, detected, layers, .. } = input::describe(&bytes).unwrap() else { panic!() };
+    let Description::Network { format, detected, layers, .. } =
+        input::describe(&bytes, &FieldOptions::default()).unwrap()
+    else {
+        panic!()
+    };
     assert_eq!((format.as_str(), layers), ("torch", vec![24, 24, 24, 24, 1]));
     assert!(detected.because.contains("net.net.0.0"), "{detected:?}");
     let w0 = input::open(&bytes, &options(serde_json::json!({"w0": 12.0}))).unwrap();
