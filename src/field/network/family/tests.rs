@@ -143,7 +143,7 @@ fn what_is_not_understood_is_refused_with_the_names_that_are_there_and_what_was_
     let bare = refusal(&[("lin0.weight", &[1, 3])]);
     assert!(bare.contains("\"lin0\" has no bias"), "{bare}");
     let norm = refusal(&[("lin0.weight", &[1, 3]), ("lin0.bias", &[1]), ("bn0.weight", &[1])]);
-    assert!(norm.contains("bn0.weight"), "{norm}");
+    assert!(norm.contains("a layer norm (\"bn0.weight\")"), "{norm}");
     let wide = refusal(&[
         ("net.0.0.weight", &[4, 3]),
         ("net.0.0.bias", &[4]),
