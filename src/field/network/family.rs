@@ -15,7 +15,7 @@ mod stack;
 
 use super::tensors::Tensors;
 use super::{Activation, Encoding, Layer, MAX_FREQUENCIES, MAX_LATENT, Network, Skip};
-use crate::field::{Domain, FieldError, Metric};
+use crate::field::FieldError;
 use stack::{Dense, Scheme, Stack};
 
 const FORMAT: &str = "network";
@@ -157,15 +157,7 @@ pub fn read(
     };
     assumed.push("the shape lies in the cube of half extent 1 (`domain`)".to_owned());
     detected.assumed = assumed;
-    let network = Network {
-        layers,
-        encoding,
-        latent_size,
-        latent_codes,
-        domain: Domain::default(),
-        metric: Metric::Bound,
-        lipschitz: None,
-    };
+    let network = Network { encoding, latent_size, latent_codes, ..Network::of_layers(layers) };
     network.check(FORMAT)?;
     Ok((network, detected))
 }
