@@ -35,7 +35,10 @@ fn anonymous() -> Vec<u8> {
     [&(header.len() as u64).to_le_bytes()[..], &header, &data].concat()
 }
 
-async fn upload(app: &App, query: &[(&str, &str)], bytes: Vec<u8>) -> reqwest::Response {
+/// Parameters and their values.
+type Query = [(&'static str, &'static str)];
+
+async fn upload(app: &App, query: &Query, bytes: Vec<u8>) -> reqwest::Response {
     let escaped = |text: &str| text.bytes().map(|byte| format!("%{byte:02x}")).collect::<String>();
     let pairs: Vec<String> = query.iter().map(|(name, value)| format!("{name}={}", escaped(value))).collect();
     let path = format!("/v1/inputs?{}", pairs.join("&"));
@@ -102,7 +105,7 @@ async fn parameters_of_an_upload_that_do_not_fit_are_refused_by_name() {
     let app = App::start(folder.path());
     let siren = || fixture("networks/families/blob_siren.pth");
     let scene = || br#"{"sphere": {"radius": 0.5}}"#.to_vec();
-    let cases: [(&[(&str, &str)], Vec<u8>, &str); 12] = [
+    let cases: [(&Query, Vec<u8>, &str); 12] = [
         (&[("famly", "idr")], siren(), "famly"),
         (&[("latent_row", "0")], siren(), "latent_row"),
         (&[("family", "idr"), ("family", "igr")], siren(), "family"),
