@@ -237,3 +237,29 @@ fn files_that_are_not_read_are_refused_by_the_name_of_what_they_are() {
         assert!(matches!(describe(bytes, &FieldOptions::default()), Err(FieldError::Unrecognized { .. })), "{bytes:?}");
     }
 }
+
+#[test]
+fn seeds_of_the_fuzz_targets_are_read_but_for_those_that_are_there_to_be_refused() {
+    let seeds = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("fuzz/seeds");
+    let refused = [
+        ("mesh", &["too_long.stl", "too_many.ply", "own_child.glb"][..]),
+        ("npy", &["cut", "integers", "not_finite", "too_many", "two_axes"]),
+        (
+            "safetensors",
+            &["deep_sdf_layer_norm", "long_header", "overflowing_shape", "own_not_finite", "own_wrong_width"],
+        ),
+        ("scene", &["cut", "deep", "faults", "numbers"]),
+    ];
+    let mut wrong = Vec::new();
+    for (target, refused) in refused {
+        for entry in std::fs::read_dir(seeds.join(target)).unwrap() {
+            let path = entry.unwrap().path();
+            let name = path.file_name().unwrap().to_str().unwrap();
+            let described = describe(&std::fs::read(&path).unwrap(), &FieldOptions::default());
+            if described.is_err() != refused.contains(&name) {
+                wrong.push(format!("{target}/{name}: {described:?}"));
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "{wrong:#?}");
+}
