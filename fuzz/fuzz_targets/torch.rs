@@ -14,6 +14,6 @@ fuzz_target!(|data: &[u8]| {
     let is_whole = data.starts_with(b"PK\x03\x04") || data.get(2..14) == HEAD.get(2..14);
     let read = if is_whole { torch::read(data) } else { torch::read(&[HEAD, data].concat()) };
     for (name, tensor) in read.into_iter().flatten() {
-        assert_eq!(tensor.values.len(), tensor.shape.iter().product(), "{name}");
+        assert_eq!(tensor.values.len(), tensor.shape.iter().product::<usize>(), "{name}");
     }
 });

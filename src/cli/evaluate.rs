@@ -35,8 +35,9 @@ fn measured(args: &EvaluateArgs) -> Result<Result<(), Vec<String>>, (u8, String)
         return Err(wrong(&args.mesh, &"--chart was given, and the file has no texture coordinates"));
     }
     let bytes = super::read_field(&args.truth).map_err(|e| wrong(&args.truth, &e))?;
-    let kind = input::describe(&bytes).map_err(|e| wrong(&args.truth, &e))?;
-    let opened = input::open(&bytes, &args.truth_options.read()?).map_err(|e| wrong(&args.truth, &e))?;
+    let options = args.truth_options.read()?;
+    let kind = input::describe(&bytes, &options).map_err(|e| wrong(&args.truth, &e))?;
+    let opened = input::open(&bytes, &options).map_err(|e| wrong(&args.truth, &e))?;
     let field = opened.field;
     if field.dimension() != 3 {
         return Err(wrong(&args.truth, &"a curve, and a surface is needed"));

@@ -196,12 +196,11 @@ pub fn open_network(bytes: &[u8], options: &FieldOptions) -> Result<(Placed, Det
     }
     let mut faults = options.faults();
     refuse(std::mem::take(&mut faults))?;
-    let (mut network, detected) = network::read(bytes, format, options)?;
+    let (network, detected) = network::read(bytes, format, options, &mut faults)?;
     let latent = options.latent_of(&network, &mut faults);
     if options.domain == Some(DomainOption::Named(DomainName::Fit)) {
         faults.push(options::fault("/domain", "not_offered", "a network's domain cannot be fitted"));
     }
-    network::overridden(&mut network, options, &mut faults);
     refuse(faults)?;
     if latent.iter().any(|z| !z.is_finite()) {
         return Err(FieldError::Unsupported { detail: "a latent code that is not finite".to_owned() });
@@ -232,20 +231,32 @@ pub fn latent_code(bytes: &[u8], options: &FieldOptions) -> Result<Vec<f32>, Fie
     let format = Format::detect(bytes)?;
     let no_code = || vec![options::fault("/latent", "not_offered", "the field has no latent code")];
     refuse(if format.is_network() { options.faults() } else { no_code() })?;
-    let (network, _) = network::read(bytes, format, options)?;
-    let mut faults = if network.latent_size == 0 { no_code() } else { Vec::new() };
+    let mut faults = Vec::new();
+    let (network, _) = network::read(bytes, format, options, &mut faults)?;
+    if network.latent_size == 0 {
+        faults = no_code();
+    }
     let code = options.latent_of(&network, &mut faults);
     refuse(faults)?;
     Ok(code)
 }
 
-/// Says what the bytes hold, having read and checked them as [`open`] would.
+/// Says what the bytes hold, having read and checked them as [`open`] would. Of the options those count that say how to
+/// read a network: `family`, `encoding`, `activation`, `w0` and `skip`.
 ///
 /// # Errors
-/// As [`open`].
-pub fn describe(bytes: &[u8]) -> Result<Description, FieldError> {
+/// As [`open`]; with one of those options given, every [`FieldError::Invalid`] is about the options.
+pub fn describe(bytes: &[u8], options: &FieldOptions) -> Result<Description, FieldError> {
     let format = Format::detect(bytes)?;
     let name = format.name().to_owned();
+    let mut faults = options.faults();
+    match format {
+        Format::Scene => faults.extend(options.refuse_network_members("a scene")),
+        Format::Mesh(_) => faults.extend(options.refuse_network_members("a mesh")),
+        Format::Grid => faults.extend(options.refuse_network_members("a grid")),
+        _ => {}
+    }
+    refuse(std::mem::take(&mut faults))?;
     Ok(match format {
         Format::Scene => {
             let scene = scene_from_slice(bytes, None)?;
@@ -253,7 +264,8 @@ pub fn describe(bytes: &[u8]) -> Result<Description, FieldError> {
             Description::Scene { format: name, dimension, metric, domain }
         }
         Format::Safetensors | Format::Npz | Format::Torch | Format::Folder | Format::Onnx => {
-            let (network, detected) = network::read(bytes, format, &FieldOptions::default())?;
+            let (network, detected) = network::read(bytes, format, options, &mut faults)?;
+            refuse(faults)?;
             Description::Network {
                 format: name,
                 detected,

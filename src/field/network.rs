@@ -125,6 +125,20 @@ pub struct Network {
 }
 
 impl Network {
+    /// A network of one shape as most files mean it: of the coordinates themselves, over the cube of half extent 1, with
+    /// values that bound a distance, by how much nobody says.
+    pub fn of_layers(layers: Vec<Layer>) -> Self {
+        Self {
+            layers,
+            encoding: Encoding::Identity,
+            latent_size: 0,
+            latent_codes: Vec::new(),
+            domain: Domain::default(),
+            metric: Metric::Bound,
+            lipschitz: None,
+        }
+    }
+
     /// Number of weights and biases; latent codes are not counted.
     pub fn parameters(&self) -> usize {
         self.layers.iter().map(|layer| layer.weights.len() + layer.bias.len()).sum()

@@ -40,7 +40,11 @@ fn fitted(meshes: &[MeshField], spec: &FitSpec, threads: usize) -> Fitted {
 
 #[test]
 fn a_ball_is_learned_where_it_is_and_in_its_own_units() {
-    let made = fitted(&[ball([300.0, -20.0, 7.0], 40.0)], &FitSpec { epochs: 60, activation: Some(Activation::Sine { w0: 10.0 }), ..small() }, 2);
+    let made = fitted(
+        &[ball([300.0, -20.0, 7.0], 40.0)],
+        &FitSpec { epochs: 60, activation: Some(Activation::Sine { w0: 10.0 }), ..small() },
+        2,
+    );
     let shape = made.report.shapes[0];
     let distance = shape.closeness.unwrap().distance;
     assert!(shape.error < 0.005 && distance.mean < 0.004 && distance.max < 0.03, "{shape:?}");

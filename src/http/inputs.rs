@@ -2,15 +2,22 @@
 
 use super::{App, Problem, body, query};
 use crate::blobs::BlobId;
-use crate::field::input::Description;
-use crate::job::{Failure, pipeline};
+use crate::field::FieldError;
+use crate::field::input::{Description, FieldOptions};
+use crate::field::network::family::Family;
+use crate::job::{Failure, pipeline, spec};
 use axum::Json;
 use axum::body::Body;
 use axum::extract::{Path, RawQuery, State};
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+/// Parameters of an upload: the members of a job's field without which some networks cannot be read.
+const READING: [&str; 5] = ["family", "encoding", "activation", "w0", "skip"];
 
 /// An uploaded input.
 #[derive(Serialize, Deserialize, utoipa::ToSchema)]
@@ -23,6 +30,10 @@ pub struct Input {
     /// When it was first uploaded.
     #[schema(value_type = String, format = DateTime)]
     created_at: Timestamp,
+    /// What the upload said of how to read it.
+    #[serde(default, skip_serializing_if = "says_nothing")]
+    #[schema(required = false)]
+    options: FieldOptions,
     /// What it is: its kind, and what was found in it.
     description: Description,
 }
@@ -52,36 +63,52 @@ impl Input {
     }
 }
 
+fn says_nothing(options: &FieldOptions) -> bool {
+    *options == FieldOptions::default()
+}
+
 /// Uploads an input
 ///
 /// Raw bytes of a scene, a network, a mesh or a sampled grid. What it is is told by its content; a file that cannot be
-/// read is refused here. Uploading the same bytes again answers 200.
+/// read is refused here. What a network's file does not say may be said in the query, as in the field of a job, which has to
+/// say it again: an input is its bytes. Uploading the same bytes again answers 200, with what they are when they are read as
+/// this upload says.
 #[utoipa::path(
     post,
     path = "/v1/inputs",
     tag = "inputs",
+    params(
+        ("family" = Option<Family>, Query, description = "the family of a network's file, in place of the one that is detected"),
+        ("encoding" = Option<String>, Query, description = "how a point becomes a network's input: a name, or JSON"),
+        ("activation" = Option<String>, Query, description = "the activation of a network's hidden layers: a name, or JSON"),
+        ("w0" = Option<String>, Query, description = "the frequency of a network's sines: a number, or two as JSON"),
+        ("skip" = Option<String>, Query, description = "how a network's input is joined to the layers that take it: JSON"),
+    ),
     request_body(content = Vec<u8>, content_type = "application/octet-stream", description = "the file"),
     responses(
         (status = 201, description = "stored", body = Input, headers(("Location", description = "where it is described"))),
         (status = 200, description = "it was there already", body = Input),
-        (status = 400, description = "a query parameter is unknown, or the body broke off"),
+        (status = 400, description = "a query parameter is unknown or does not fit the file, or the body broke off"),
         (status = 413, description = "the file is too large"),
         (status = 422, description = "the file cannot be read as a field"),
         (status = 503, description = "the service is stopping"),
     )
 )]
 pub async fn upload(State(app): State<App>, RawQuery(raw): RawQuery, body: Body) -> Result<Response, Problem> {
-    query::parameters(raw.as_deref(), &[], &[])?;
+    let options = reading_options(raw.as_deref())?;
     let bytes = body::read(body, app.limits.input_bytes).await?;
     let hashed = bytes.clone();
     let id = tokio::task::spawn_blocking(move || BlobId::of(&hashed)).await.map_err(joined)?;
-    if let Some(known) = app.blobs.note(id).await? {
-        return Ok((StatusCode::OK, Json(read_note(&known)?)).into_response());
+    if let Some(note) = app.blobs.note(id).await? {
+        let mut known = read_note(&note)?;
+        // the note keeps what the first upload said: an answer depends on its own request alone
+        if known.options != options {
+            known = Input { description: described(bytes, options.clone()).await?, options, ..known };
+        }
+        return Ok((StatusCode::OK, Json(known)).into_response());
     }
-    let described = bytes.clone();
-    let description = tokio::task::spawn_blocking(move || pipeline::describe(&described)).await.map_err(joined)?;
-    let description = description.map_err(|error| Failure::from_field(&error, ""))?;
-    let input = Input { id, bytes: bytes.len() as u64, created_at: Timestamp::now(), description };
+    let description = described(bytes.clone(), options.clone()).await?;
+    let input = Input { id, bytes: bytes.len() as u64, created_at: Timestamp::now(), options, description };
     app.blobs.put(bytes).await?;
     // the note comes last: an input that is known is complete
     let note = serde_json::to_vec(&input).map_err(|_| Problem::internal())?;
@@ -90,7 +117,32 @@ pub async fn upload(State(app): State<App>, RawQuery(raw): RawQuery, body: Body)
     Ok((StatusCode::CREATED, [(header::LOCATION, location)], Json(input)).into_response())
 }
 
+/// What the query says of how to read the file. A value that is no JSON is a name.
+fn reading_options(query: Option<&str>) -> Result<FieldOptions, Problem> {
+    let pairs = query::parameters(query, &READING, &[])?;
+    let member = |(name, text): (String, String)| {
+        let value = serde_json::from_str(&text).unwrap_or(Value::String(text));
+        (name, value)
+    };
+    let members = pairs.into_iter().map(member).collect();
+    spec::field_options(&members).map_err(|faults| Problem::parameters(&faults))
+}
+
+/// What the bytes are, found off the runtime.
+async fn described(bytes: Bytes, options: FieldOptions) -> Result<Description, Problem> {
+    let said = !says_nothing(&options);
+    let description =
+        tokio::task::spawn_blocking(move || pipeline::describe(&bytes, &options)).await.map_err(joined)?;
+    description.map_err(|error| match error {
+        // where something is said, faults are those of what is said: a scene takes none of it, and only scenes have others
+        FieldError::Invalid { faults } if said => Problem::parameters(&faults),
+        error => Failure::from_field(&error, "").into(),
+    })
+}
+
 /// Describes an input
+///
+/// As the parameters of its first upload said to read it.
 #[utoipa::path(
     get,
     path = "/v1/inputs/{id}",

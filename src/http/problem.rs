@@ -90,6 +90,11 @@ impl Problem {
     pub fn query(detail: impl Into<String>) -> Self {
         Self::bad_request("invalid_query", "a query parameter is invalid", detail)
     }
+    /// 400: query parameters are wrong; the faults' pointers begin with the parameter's name.
+    pub fn parameters(faults: &[Fault]) -> Self {
+        let said = faults.iter().map(|f| format!("{}: {}", f.pointer.trim_start_matches('/'), f.detail));
+        Self::query(said.collect::<Vec<_>>().join("; "))
+    }
     /// 400: a header is wrong.
     pub fn header(detail: impl Into<String>) -> Self {
         Self::bad_request("invalid_header", "a header is invalid", detail)

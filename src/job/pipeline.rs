@@ -135,9 +135,9 @@ pub fn check_scene(scene: &Value) -> Result<u8, FieldError> {
     Scene::from_value(scene).map(|scene| scene.dimension())
 }
 
-/// Tells what bytes are, without running them.
-pub fn describe(bytes: &[u8]) -> Result<Description, FieldError> {
-    input::describe(bytes)
+/// Tells what bytes are, read as the options say, without running them.
+pub fn describe(bytes: &[u8], options: &FieldOptions) -> Result<Description, FieldError> {
+    input::describe(bytes, options)
 }
 
 /// Opens the field of a request; `bytes` are those of the input that it names, if it names one. Faults are pointed to

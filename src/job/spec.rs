@@ -16,7 +16,7 @@ use crate::shrink::curve::{MAX_SAMPLES, MIN_SAMPLES};
 use crate::shrink::lattice::LatticeSpec;
 use read::{Faults, read_spec};
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
+use serde_json::{Map, Value};
 use std::collections::BTreeMap;
 
 /// Columns of a lat-long lattice: fewer than 8 are no sphere, more than 2,048 are no use in `f32`.
@@ -323,6 +323,16 @@ impl JobSpec {
         }
         if faults.0.is_empty() { Ok(self) } else { Err(faults.0) }
     }
+}
+
+/// Reads options of a field; members that are none are passed over.
+///
+/// # Errors
+/// Every fault that was found, with pointers from the root of `members`.
+pub fn field_options(members: &Map<String, Value>) -> Result<FieldOptions, Vec<Fault>> {
+    let mut faults = Faults::default();
+    let options = read::read_options(members, "", &mut faults);
+    if faults.0.is_empty() { Ok(options) } else { Err(faults.0) }
 }
 
 /// Checks the limits of a lattice; faults are pointed to below `pointer`.

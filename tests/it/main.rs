@@ -12,6 +12,7 @@ mod faults;
 mod fit;
 mod losses;
 mod metrics;
+mod reading;
 mod refusals;
 mod relaxed;
 mod sensitivity;

@@ -15,7 +15,7 @@ use crate::cli::scenes;
 use crate::losses::{Losses, count, number};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
-use shrinkd::field::input::{Description, describe};
+use shrinkd::field::input::{Description, FieldOptions, describe};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::Mutex;
@@ -148,7 +148,7 @@ fn extract(field: &Path) -> Result<Metrics, String> {
 }
 
 fn takes_a_latent_code(field: &Path) -> bool {
-    let described = describe(&std::fs::read(field).expect("reads"));
+    let described = describe(&std::fs::read(field).expect("reads"), &FieldOptions::default());
     matches!(described, Ok(Description::Network { latent_rows, .. }) if latent_rows > 0)
 }
 

@@ -86,7 +86,7 @@ pub fn run(shape: &Shape, task: &Task<'_>, add: Add<'_>) -> Result<(), Ended> {
 fn open(shape: &Shape, watch: &Arc<Watch>) -> Result<Opened, String> {
     let bytes = std::fs::read(&shape.path).map_err(|e| e.to_string())?;
     // a network of many shapes stands for its first
-    let latent_row = match pipeline::describe(&bytes) {
+    let latent_row = match pipeline::describe(&bytes, &FieldOptions::default()) {
         Ok(Description::Network { latent_rows: 1.., .. }) => Some(0),
         _ => None,
     };

@@ -6,8 +6,32 @@ use crate::field::network::family::{self, Detected, Family, Hints};
 use crate::field::network::{Activation, Network, folder, niq, onnx, safetensors, torch};
 use crate::field::{Fault, FieldError};
 
-/// Reads a network, and says what it was taken for.
-pub(super) fn read(bytes: &[u8], format: Format, options: &FieldOptions) -> Result<(Network, Detected), FieldError> {
+/// Reads a network, puts what the options say in the place of what was read or assumed, and says what it was taken for.
+/// An option for which the network has no place is a fault.
+pub(super) fn read(
+    bytes: &[u8],
+    format: Format,
+    options: &FieldOptions,
+    faults: &mut Vec<Fault>,
+) -> Result<(Network, Detected), FieldError> {
+    let (mut network, mut detected) = from_file(bytes, format, options)?;
+    overridden(&mut network, options, faults);
+    for (name, is_said) in [
+        ("activation", options.activation.is_some()),
+        // an activation that is said comes with its frequency
+        ("w0", options.w0.is_some() || options.activation.is_some()),
+        ("skip", options.skip.is_some()),
+        ("domain", options.domain.is_some()),
+    ] {
+        if is_said {
+            detected.no_longer_assumes(name);
+        }
+    }
+    Ok((network, detected))
+}
+
+/// The network as its file and its family have it.
+fn from_file(bytes: &[u8], format: Format, options: &FieldOptions) -> Result<(Network, Detected), FieldError> {
     let hints = Hints { family: options.family, encoding: options.encoding };
     let itself = |family, because: &str| Detected { family, because: because.to_owned(), assumed: Vec::new() };
     let told = |network: Network, family, because: &str| match not_offered(&hints) {
@@ -34,7 +58,7 @@ fn not_offered(hints: &Hints) -> Option<Fault> {
 }
 
 /// Puts what the options say in the place of what was read or assumed.
-pub(super) fn overridden(network: &mut Network, options: &FieldOptions, faults: &mut Vec<Fault>) {
+fn overridden(network: &mut Network, options: &FieldOptions, faults: &mut Vec<Fault>) {
     let Some((_, hidden)) = network.layers.split_last_mut() else { return };
     if let Some(activation) = options.activation {
         hidden.iter_mut().for_each(|layer| layer.activation = activation);

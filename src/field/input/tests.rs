@@ -189,7 +189,7 @@ fn a_flat_scene_only_moves_in_its_plane() {
 
 #[test]
 fn files_are_described() {
-    let describe = |bytes: &[u8]| serde_json::to_value(describe(bytes).unwrap()).unwrap();
+    let describe = |bytes: &[u8]| serde_json::to_value(describe(bytes, &FieldOptions::default()).unwrap()).unwrap();
     let blob = describe(&fixture("blob.npz"));
     assert_eq!(blob["kind"], "network");
     assert_eq!(blob["format"], "npz");
@@ -230,10 +230,36 @@ fn files_that_are_not_read_are_refused_by_the_name_of_what_they_are() {
         (b"\x80\x04\x95".to_vec(), "pickle"),
     ];
     for (bytes, name) in cases {
-        let refusal = describe(&bytes).expect_err("no field").to_string();
+        let refusal = describe(&bytes, &FieldOptions::default()).expect_err("no field").to_string();
         assert!(refusal.contains(name), "{refusal}");
     }
     for bytes in [&b""[..], b"\0", b"<html></html>", b"hello", &[0xff; 300]] {
-        assert!(matches!(describe(bytes), Err(FieldError::Unrecognized { .. })), "{bytes:?}");
+        assert!(matches!(describe(bytes, &FieldOptions::default()), Err(FieldError::Unrecognized { .. })), "{bytes:?}");
     }
+}
+
+#[test]
+fn seeds_of_the_fuzz_targets_are_read_but_for_those_that_are_there_to_be_refused() {
+    let seeds = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("fuzz/seeds");
+    let refused = [
+        ("mesh", &["too_long.stl", "too_many.ply", "own_child.glb"][..]),
+        ("npy", &["cut", "integers", "not_finite", "too_many", "two_axes"]),
+        (
+            "safetensors",
+            &["deep_sdf_layer_norm", "long_header", "overflowing_shape", "own_not_finite", "own_wrong_width"],
+        ),
+        ("scene", &["cut", "deep", "faults", "numbers"]),
+    ];
+    let mut wrong = Vec::new();
+    for (target, refused) in refused {
+        for entry in std::fs::read_dir(seeds.join(target)).unwrap() {
+            let path = entry.unwrap().path();
+            let name = path.file_name().unwrap().to_str().unwrap();
+            let described = describe(&std::fs::read(&path).unwrap(), &FieldOptions::default());
+            if described.is_err() != refused.contains(&name) {
+                wrong.push(format!("{target}/{name}: {described:?}"));
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "{wrong:#?}");
 }

@@ -26,8 +26,8 @@ pub(super) fn closest(p: DVec3, a: DVec3, ab: DVec3, ac: DVec3) -> (DVec3, Featu
     }
     let vc = d1 * d4 - d3 * d2;
     if vc <= 0.0 && d1 >= 0.0 && d3 <= 0.0 {
-        // d1 = d3 = 0 only when the edge has no length, which the corner regions have taken already
-        return (a + ab * (d1 / (d1 - d3)), Feature::Edge(0));
+        // an edge whose square is nothing divides nothing by nothing
+        return if d1 > d3 { (a + ab * (d1 / (d1 - d3)), Feature::Edge(0)) } else { nearest_edge(p, a, ab, ac) };
     }
     let cp = ap - ac;
     let (d5, d6) = (ab.dot(cp), ac.dot(cp));
@@ -36,12 +36,17 @@ pub(super) fn closest(p: DVec3, a: DVec3, ab: DVec3, ac: DVec3) -> (DVec3, Featu
     }
     let vb = d5 * d2 - d1 * d6;
     if vb <= 0.0 && d2 >= 0.0 && d6 <= 0.0 {
-        return (a + ac * (d2 / (d2 - d6)), Feature::Edge(2));
+        return if d2 > d6 { (a + ac * (d2 / (d2 - d6)), Feature::Edge(2)) } else { nearest_edge(p, a, ab, ac) };
     }
     let va = d3 * d6 - d5 * d4;
     let (along, back) = (d4 - d3, d5 - d6);
     if va <= 0.0 && along >= 0.0 && back >= 0.0 {
-        return (a + ab + (ac - ab) * (along / (along + back)), Feature::Edge(1));
+        let total = along + back;
+        return if total > 0.0 {
+            (a + ab + (ac - ab) * (along / total), Feature::Edge(1))
+        } else {
+            nearest_edge(p, a, ab, ac)
+        };
     }
     let total = va + vb + vc;
     if total <= 0.0 {
@@ -66,4 +71,22 @@ fn nearest_edge(p: DVec3, a: DVec3, ab: DVec3, ac: DVec3) -> (DVec3, Feature) {
     .into_iter()
     .min_by(|x, y| x.0.distance_squared(p).total_cmp(&y.0.distance_squared(p)))
     .unwrap_or((a, Feature::Corner(0)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_edge_whose_square_is_nothing_has_a_nearest_point() {
+        let short = DVec3::X * 1e-170;
+        let corners = [DVec3::ZERO, short, DVec3::Y];
+        for turn in 0..3 {
+            let [a, b, c] = [0, 1, 2].map(|k| corners[(turn + k) % 3]);
+            for (p, nearest) in [(DVec3::new(0.0, 0.5, 0.25), 0.5), (DVec3::new(0.0, 2.0, 0.0), 1.0), (DVec3::Z, 0.0)] {
+                let (found, _) = closest(p, a, b - a, c - a);
+                assert!(found.distance(DVec3::Y * nearest) < 1e-12, "{p} is nearest to {found}");
+            }
+        }
+    }
 }

@@ -15,7 +15,7 @@ mod stack;
 
 use super::tensors::Tensors;
 use super::{Activation, Encoding, Layer, MAX_FREQUENCIES, MAX_LATENT, Network, Skip};
-use crate::field::{Domain, FieldError, Metric};
+use crate::field::FieldError;
 use stack::{Dense, Scheme, Stack};
 
 const FORMAT: &str = "network";
@@ -57,9 +57,18 @@ pub struct Detected {
     pub family: Family,
     /// What in the file says so.
     pub because: String,
-    /// What the file does not say and was taken as is usual in the family; options override it.
+    /// What neither the file nor an option says and was taken as is usual in the family. What an option overrides ends with
+    /// its name in parentheses.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub assumed: Vec<String>,
+}
+
+impl Detected {
+    /// Forgets what was assumed in the place of an option that is given.
+    pub(in crate::field) fn no_longer_assumes(&mut self, option: &str) {
+        let ending = format!("(`{option}`)");
+        self.assumed.retain(|assumption| !assumption.ends_with(&ending));
+    }
 }
 
 /// What a `specs.json` of DeepSDF says about the network.
@@ -148,15 +157,7 @@ pub fn read(
     };
     assumed.push("the shape lies in the cube of half extent 1 (`domain`)".to_owned());
     detected.assumed = assumed;
-    let network = Network {
-        layers,
-        encoding,
-        latent_size,
-        latent_codes,
-        domain: Domain::default(),
-        metric: Metric::Bound,
-        lipschitz: None,
-    };
+    let network = Network { encoding, latent_size, latent_codes, ..Network::of_layers(layers) };
     network.check(FORMAT)?;
     Ok((network, detected))
 }

@@ -4,9 +4,9 @@
 //! shape `[inputs, outputs]` and `b` of shape `[outputs]`, activations (`relu`, `elu`, `tanh`, `sigmoid`, `sin`) and at last
 //! `squeeze_last` with a parameter `_` that means nothing. The shape lies in the cube of half extent 1.
 
-use super::{Activation, Encoding, Layer, MAX_LAYERS, MAX_PARAMETERS, Network, zip};
+use super::{Activation, Layer, MAX_LAYERS, MAX_PARAMETERS, Network, zip};
+use crate::field::FieldError;
 use crate::field::grid::npy;
-use crate::field::{Domain, FieldError, Metric};
 use std::collections::BTreeMap;
 
 const FORMAT: &str = "npz";
@@ -87,15 +87,7 @@ pub fn read(bytes: &[u8]) -> Result<Network, FieldError> {
         }
         activated = true;
     }
-    let network = Network {
-        layers,
-        encoding: Encoding::Identity,
-        latent_size: 0,
-        latent_codes: Vec::new(),
-        domain: Domain::default(),
-        metric: Metric::Bound,
-        lipschitz: None,
-    };
+    let network = Network::of_layers(layers);
     network.check(FORMAT)?;
     Ok(network)
 }

@@ -57,15 +57,7 @@ fn made(
             layer
         })
         .collect();
-    let network = Network {
-        layers,
-        encoding,
-        latent_size,
-        latent_codes: Vec::new(),
-        domain: Domain::default(),
-        metric: Metric::Bound,
-        lipschitz: None,
-    };
+    let network = Network { encoding, latent_size, ..Network::of_layers(layers) };
     network.check("test").unwrap();
     network
 }

@@ -17,6 +17,9 @@ use serde::Deserialize as _;
 use serde_json::{Map, Value};
 use std::collections::BTreeMap;
 
+/// What an activation may be.
+const ACTIVATION: &str = "\"identity\", \"relu\", \"elu\", \"tanh\", \"sigmoid\", {\"sine\": {\"w0\": number}} or \
+                          {\"softplus\": {\"beta\": number}}";
 /// Faults reported in one answer.
 const MAX_FAULTS: usize = 32;
 
@@ -296,13 +299,19 @@ fn read_field(value: &Value, pointer: &str, faults: &mut Faults) -> FieldSpec {
         (Some(_), Some(_)) => faults.add(pointer, "ambiguous", "give scene or input, not both"),
         (None, None) => faults.add(pointer, "missing_member", "give scene or input"),
     }
-    field.options = FieldOptions {
+    field.options = read_options(object, pointer, faults);
+    field
+}
+
+/// Reads the options among the members of a field at `pointer`.
+pub fn read_options(object: &Map<String, Value>, pointer: &str, faults: &mut Faults) -> FieldOptions {
+    let options = FieldOptions {
         latent: object.get("latent").and_then(|latent| read_latent(latent, &format!("{pointer}/latent"), faults)),
         latent_row: object.get("latent_row").and_then(|row| faults.count(row, &format!("{pointer}/latent_row"))),
         transform: option(object, pointer, "transform", "scale, rotate {axis [3], angle}, translate [3]", faults),
         domain: option(object, pointer, "domain", "\"fit\" or {\"min\": [x, y, z], \"max\": [x, y, z]}", faults),
         level: object.get("level").and_then(|level| faults.number(level, &format!("{pointer}/level"))),
-        activation: option(object, pointer, "activation", "the name of an activation", faults),
+        activation: option(object, pointer, "activation", ACTIVATION, faults),
         family: option(object, pointer, "family", "the name of a family of networks", faults),
         w0: option(object, pointer, "w0", "a frequency, or the first layer's and the others'", faults),
         skip: option(object, pointer, "skip", "{\"scale\": number}", faults),
@@ -311,10 +320,10 @@ fn read_field(value: &Value, pointer: &str, faults: &mut Faults) -> FieldSpec {
         scale: object.get("scale").and_then(|scale| faults.number(scale, &format!("{pointer}/scale"))),
     };
     // what an option may be is known in the field's room
-    if let Err(FieldError::Invalid { faults: wrong }) = field.options.check() {
+    if let Err(FieldError::Invalid { faults: wrong }) = options.check() {
         faults.0.extend(wrong.into_iter().map(|f| Fault { pointer: format!("{pointer}{}", f.pointer), ..f }));
     }
-    field
+    options
 }
 
 /// A member that its own type reads.

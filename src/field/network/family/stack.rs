@@ -124,7 +124,9 @@ impl Stack {
             own.strip_prefix("bn").is_some_and(|rest| rest.starts_with(|c: char| c.is_ascii_digit()))
         });
         if let Some(name) = normed_without {
-            return Err(FieldError::Unsupported { detail: format!("a layer norm ({name:?})") });
+            let detail =
+                format!("a layer norm ({name:?}): an activation of all outputs of a layer together is not offered");
+            return Err(FieldError::Unsupported { detail });
         }
         for (expected, (&number, parts)) in layers.iter().enumerate() {
             let last = scheme == Scheme::Layers && expected + 1 == layers.len();

@@ -77,7 +77,11 @@ fn every_family_is_told_and_agrees_with_pytorch_in_value_and_gradient() {
 #[test]
 fn a_description_names_the_family_and_what_was_assumed() {
     let bytes = std::fs::read(committed().join("siren.pth")).unwrap();
-    let Description::Network { format, detected, layers, .. } = input::describe(&bytes).unwrap() else { panic!() };
+    let Description::Network { format, detected, layers, .. } =
+        input::describe(&bytes, &FieldOptions::default()).unwrap()
+    else {
+        panic!()
+    };
     assert_eq!((format.as_str(), layers), ("torch", vec![24, 24, 24, 24, 1]));
     assert!(detected.because.contains("net.net.0.0"), "{detected:?}");
     let w0 = input::open(&bytes, &options(serde_json::json!({"w0": 12.0}))).unwrap();
@@ -139,7 +143,7 @@ fn what_is_not_understood_is_refused_with_the_names_that_are_there_and_what_was_
     let bare = refusal(&[("lin0.weight", &[1, 3])]);
     assert!(bare.contains("\"lin0\" has no bias"), "{bare}");
     let norm = refusal(&[("lin0.weight", &[1, 3]), ("lin0.bias", &[1]), ("bn0.weight", &[1])]);
-    assert!(norm.contains("bn0.weight"), "{norm}");
+    assert!(norm.contains("a layer norm (\"bn0.weight\")"), "{norm}");
     let wide = refusal(&[
         ("net.0.0.weight", &[4, 3]),
         ("net.0.0.bias", &[4]),

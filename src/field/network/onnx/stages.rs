@@ -6,10 +6,10 @@
 
 use super::budget::Budget;
 use super::forms::{Core, Forms, Unit};
+use crate::field::FieldError;
 use crate::field::network::{
     Activation, Encoding, Layer, MAX_FREQUENCIES, MAX_LAYERS, MAX_PARAMETERS, MAX_WIDTH, Network, Skip,
 };
-use crate::field::{Domain, FieldError, Metric};
 use std::f64::consts::FRAC_PI_2;
 use std::rc::Rc;
 
@@ -123,15 +123,7 @@ impl Stages {
         let (encoding, places) = self.encoding(&parents, &needed, last, latent_size);
         let depths = self.depths(&parents, &needed, &places)?;
         let plan = Plan { stages: &self, parents, depths, places, input: latent_size + encoding.size() };
-        Ok(Network {
-            layers: plan.layers(budget)?,
-            encoding,
-            latent_size,
-            latent_codes: Vec::new(),
-            domain: Domain::default(),
-            metric: Metric::Bound,
-            lipschitz: None,
-        })
+        Ok(Network { encoding, latent_size, ..Network::of_layers(plan.layers(budget)?) })
     }
 
     /// The encoding that the needed sines of coordinates make up, and for every stage that is part of it the columns of the

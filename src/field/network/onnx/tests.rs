@@ -25,9 +25,12 @@ const FIXTURES: [&str; 17] = [
     "elu_matmul",
 ];
 
+fn committed() -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/networks/onnx")
+}
+
 fn file(name: &str) -> Vec<u8> {
-    let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/networks/onnx");
-    std::fs::read(folder.join(name)).unwrap()
+    std::fs::read(committed().join(name)).unwrap()
 }
 
 fn fixture(name: &str) -> Vec<u8> {
@@ -41,12 +44,18 @@ fn opened(name: &str) -> Network {
 }
 
 /// The error relative to what PyTorch's autograd gives in double precision: of a value to its magnitude, but not to less than
-/// a hundredth of the largest of the 50 (single precision rounds the sums that a value near zero is the difference of); of a
-/// gradient to its length.
+/// a hundredth of the largest (single precision rounds the sums that a value near zero is the difference of); of a
+/// gradient to its length. `SHRINKD_ONNX` names a folder with the answers of ONNX' own evaluator at more points
+/// (`tests/reference/evaluate_onnx.py`), some of them nearer to zero: there the least magnitude is that of the families' test.
 #[test]
 fn values_and_gradients_are_those_of_the_framework() {
+    let (folder, small) = match std::env::var_os("SHRINKD_ONNX") {
+        Some(folder) => (PathBuf::from(folder), 2e-2),
+        None => (committed(), 1e-2),
+    };
     for name in FIXTURES {
-        let expected: serde_json::Value = serde_json::from_slice(&file(&format!("{name}.json"))).unwrap();
+        let text = std::fs::read(folder.join(format!("{name}.json"))).unwrap();
+        let expected: serde_json::Value = serde_json::from_slice(&text).unwrap();
         let list = |value: &serde_json::Value| -> Vec<f64> {
             value.as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect()
         };
@@ -63,15 +72,15 @@ fn values_and_gradients_are_those_of_the_framework() {
         let largest = values.iter().fold(0.0, |m: f64, v| m.max(v.abs()));
         let (mut worst_value, mut worst_gradient) = (0.0f64, 0.0f64);
         for (i, value) in values.iter().enumerate() {
-            let error = (f64::from(found[i]) - value).abs() / value.abs().max(1e-2 * largest);
+            let error = (f64::from(found[i]) - value).abs() / value.abs().max(small * largest);
             worst_value = worst_value.max(error);
             let length = gradients[i].iter().map(|g| g * g).sum::<f64>().sqrt();
             let off = (0..3).map(|a| (f64::from(slopes[a][i]) - gradients[i][a]).powi(2)).sum::<f64>().sqrt();
             worst_gradient = worst_gradient.max(off / length);
         }
-        println!("{name}: value {worst_value:.1e}, gradient {worst_gradient:.1e}");
+        println!("{name}: {} points, value {worst_value:.1e}, gradient {worst_gradient:.1e}", values.len());
         assert!(worst_value < 1e-4 && worst_gradient < 1e-4, "{name}: {worst_value:e} {worst_gradient:e}");
-        assert_eq!(values.len(), 50);
+        assert!(values.len() >= 50);
     }
 }
 
