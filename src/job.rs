@@ -132,8 +132,8 @@ impl State {
 #[serde(default)]
 pub struct ProgressView {
     /// Name of the stage: `topology`, then in every attempt `contract`, `remesh`, `map`, `resample`, `untangle`, `slide`, `sharpen`,
-    /// `separate` and `measure`, then `relax` (with `relax_uv`) and `write`; the method `paper` has `shrink` before `measure`. A fit has
-    /// `sample`, `train` and `measure`.
+    /// `separate` and `measure`, then `relax` (with `relax_uv`) and `write`; the method `paper` has `shrink` before `measure`, and a
+    /// warm start has `warm` in place of the stages up to `resample`. A fit has `sample`, `train` and `measure`.
     pub stage: String,
     /// Number of the attempt at the surface, from 1 (not of the worker's, which the job counts); 0 before the first.
     pub attempt: u32,

@@ -20,10 +20,16 @@ use std::sync::atomic::AtomicU32;
 /// How often the way from one stop to the next is halved at most.
 pub const HALVINGS: u32 = 4;
 
+/// Surfaces that are made between two stops at most by warm starts: what takes more costs more than beginning anew.
+const MOST: u32 = 12;
+
+/// Opens the field of a code.
+pub type Open<'p, E> = dyn Fn(&[f32]) -> Result<Box<dyn Field>, E> + 'p;
+
 /// What a path is followed with.
 pub struct Path<'p, E> {
     /// Opens the field of a code.
-    pub open: &'p dyn Fn(&[f32]) -> Result<Box<dyn Field>, E>,
+    pub open: &'p Open<'p, E>,
     /// How every surface is made; without a weight, and without relaxed charts.
     pub spec: &'p ShrinkSpec,
     /// What may be spent on a surface that is made from nothing.
@@ -116,7 +122,7 @@ impl<E> Path<'_, E> {
         let earlier = from.map(|(_, earlier)| earlier);
         let Way { surface, mut report, between } = match warm {
             Some(way) => way,
-            None => self.from_nothing(earlier, to, leg)?,
+            None => self.begin_anew(earlier, to, leg)?,
         };
         report.evaluations = Evaluations::new(&leg.tally.by_stage(), report.vertices);
         report.attempts = leg.made.get();
@@ -146,7 +152,7 @@ impl<E> Path<'_, E> {
         if let Ok((surface, report)) = passed {
             return Ok(Some(Way { surface, report, between: 0 }));
         }
-        if halvings == 0 {
+        if halvings == 0 || leg.made.get() >= MOST {
             return Ok(None);
         }
         let middle: Vec<f32> = from.iter().zip(to).map(|(a, b)| 0.5 * (a + b)).collect();
@@ -156,7 +162,7 @@ impl<E> Path<'_, E> {
     }
 
     /// Makes the surface of a code from nothing, with the triangles of the `earlier` one.
-    fn from_nothing(&self, earlier: Option<&Earlier>, to: &[f32], leg: &Leg<'_>) -> Result<Way, PathError<E>> {
+    fn begin_anew(&self, earlier: Option<&Earlier>, to: &[f32], leg: &Leg<'_>) -> Result<Way, PathError<E>> {
         let field = (self.open)(to).map_err(PathError::Field)?;
         let sampler = Sampler::new(field.as_ref(), leg.settings, &leg.tally);
         let Extracted { surface, report, .. } = extract(&sampler, self.spec, None, self.budget, None, &|_| {})?;

@@ -24,8 +24,8 @@ pub struct Lengths {
 pub struct Moved {
     /// From where a vertex was to where it is.
     pub moved: Lengths,
-    /// From the place of the surface that is nearest to where a vertex was, which is straight ahead, to where it is: 0
-    /// for a vertex that moved along the surface's normal.
+    /// From the place of the surface that is straight ahead of where a vertex was, where the surface's normal leads to it, to
+    /// where it is: 0 for a vertex that moved along that normal.
     pub drift: Lengths,
 }
 

@@ -24,7 +24,9 @@ use glam::DVec3;
 /// Farthest that a step towards the new zero level set goes, in edges of the lattice. Steps follow each other, and none is
 /// taken that does not bring the value down.
 const REACH: f64 = 8.0;
-/// A surface of which one in so many triangles is folded when untangling has ended is past repair: it moved too far.
+/// A surface of which one in so many triangles is turned away from the normals of its corners moved too far to be untangled, ...
+const TURNED: usize = 4;
+/// ... and one of which one in so many is folded when that has ended is past repair.
 const FOLDED: usize = 20;
 
 /// A surface that was made before: where a warm start begins.
@@ -62,11 +64,18 @@ pub fn warm(scene: &Sampler<'_>, earlier: &Earlier) -> Result<Option<Wrap>, Canc
     let started: Vec<DVec3> = earlier.positions.iter().map(|&p| frame.from_scene(p)).collect();
     stage("warm", 0.0, Some(&started), None);
     let area: f64 = triangles.iter().map(|&t| 0.5 * normal(&started, t).length()).sum();
+    if !(area > 0.0 && area.is_finite()) {
+        return Ok(None);
+    }
     let edge = (area / started.len() as f64).sqrt();
     let mut at = project(&sampler, started.clone(), &earlier.normals, REACH * edge, 1e-3 * edge)?;
+    let outward = |t: &[u32; 3]| normal(&at.positions, *t).dot(t.iter().map(|&v| at.gradients[v as usize]).sum()) > 0.0;
+    if TURNED * triangles.iter().filter(|t| !outward(t)).count() > triangles.len() {
+        return Ok(None);
+    }
     stage("untangle", 0.3, Some(&at.positions), None);
     let folds = Tangle::new(&sampler, &triangles, &at.positions).relax_patches(&mut at, &started, 2)?;
-    if FOLDED * folds > triangles.len() {
+    if FOLDED * folds > triangles.len() || !at.positions.iter().all(|p| p.is_finite()) {
         return Ok(None);
     }
     stage("slide", 0.6, Some(&at.positions), Some(folds as u64));
@@ -162,10 +171,14 @@ mod tests {
         let field = scene(&json!({"sphere": {"radius": 0.5}}));
         let sound = ball();
         let nothing = Earlier { positions: vec![DVec3::ZERO; sound.positions.len()], ..sound.clone() };
-        let shuffled = |i: usize| sound.positions[(i * 7919) % sound.positions.len()];
+        // the high bits of a product with the golden ratio's: neighbours end anywhere
+        let shuffled = |i: usize| {
+            let bits = (i as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+            sound.positions[((bits ^ (bits << 21)) >> 20) as usize % sound.positions.len()]
+        };
         let tangled = Earlier { positions: (0..sound.positions.len()).map(shuffled).collect(), ..sound.clone() };
-        for earlier in [nothing, tangled] {
-            assert!(warmed(&field, &earlier, 1).0.is_none());
+        for (name, earlier) in [("nothing", nothing), ("tangled", tangled)] {
+            assert!(warmed(&field, &earlier, 1).0.is_none(), "{name}");
         }
     }
 }
