@@ -55,7 +55,7 @@ fn api() -> OpenApiRouter<App> {
         .routes(routes!(jobs::submit, list::list))
         .routes(routes!(jobs::get, jobs::forget))
         .routes(routes!(jobs::cancel))
-        .routes(routes!(jobs::sensitivity::submit))
+        .routes(routes!(jobs::sensitivity::differentiate))
         .routes(routes!(events::events))
         .routes(routes!(outputs::download))
         // for whoever operates it

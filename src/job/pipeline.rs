@@ -4,7 +4,7 @@ mod fitting;
 mod plane;
 mod sensing;
 
-pub use fitting::{Kept, open_mesh, run_fit};
+pub use fitting::{Kept, StateBytes, open_mesh, run_fit};
 pub use plane::{CurveMade, make_curve};
 pub use sensing::{Carried, SensitivityReport, run_sensitivity, sensitivity_of};
 

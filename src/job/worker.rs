@@ -9,7 +9,7 @@ use super::spec::{FieldSpec, Work};
 use super::{EventKind, Output, OutputName, ProgressView};
 use crate::blobs::{BlobError, BlobId, Blobs};
 use crate::engine::{Claim, Engine, EngineError, Outcome, Renewal, Update};
-use crate::job::pipeline::{self, Asked, Kept};
+use crate::job::pipeline::{self, Asked, Kept, StateBytes};
 use crate::settings::{CancelToken, Progress, Settings};
 use bytes::Bytes;
 use std::cell::Cell;
@@ -228,7 +228,7 @@ impl Worker {
                     Work::Fit(fitting) => {
                         // one after the first epoch, then one every few seconds
                         let last = Cell::new(None::<Instant>);
-                        let keep = |bytes: &dyn Fn() -> Vec<u8>| {
+                        let keep = |bytes: &StateBytes<'_>| {
                             if last.get().is_some_and(|last| last.elapsed() < CHECKPOINT_EVERY) {
                                 return;
                             }

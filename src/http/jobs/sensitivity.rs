@@ -42,7 +42,7 @@ use std::collections::BTreeMap;
         (status = 503, description = "the service is stopping"),
     )
 )]
-pub async fn submit(
+pub async fn differentiate(
     State(app): State<App>,
     Path(id): Path<String>,
     RawQuery(raw): RawQuery,

@@ -10,12 +10,15 @@ use crate::job::spec::{Fitting, OutputName};
 use crate::settings::Settings;
 use serde_json::json;
 
+/// Makes the bytes of a training's state.
+pub type StateBytes<'a> = dyn Fn() -> Vec<u8> + 'a;
+
 /// What a training keeps while it runs.
 pub struct Kept<'a> {
     /// The bytes of the last state, from this run of the job or another.
     pub before: Option<&'a [u8]>,
-    /// Called after every epoch; `bytes` makes the state to be kept, should it be time to keep one.
-    pub keep: &'a dyn Fn(&dyn Fn() -> Vec<u8>),
+    /// Called after every epoch with what makes the state, should it be time to keep one.
+    pub keep: &'a dyn Fn(&StateBytes<'_>),
 }
 
 /// Fits a network to meshes, whose files are `meshes` in the order of the request.
