@@ -172,6 +172,18 @@ pub struct Output {
     pub certified: bool,
 }
 
+/// What is measured about a job's result, by its kind.
+#[derive(Serialize, utoipa::ToSchema)]
+#[serde(untagged)]
+pub enum Metrics {
+    /// Of a surface or a curve.
+    Shrink(crate::measure::AnyReport),
+    /// Of a network.
+    Fit(crate::fit::FitReport),
+    /// Of derivatives.
+    Sensitivity(pipeline::SensitivityReport),
+}
+
 /// A job's record: what clients see.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Job {
@@ -212,7 +224,7 @@ pub struct Job {
     /// What was measured about the result: the same object as the output `report`. A job that failed with `not_certified`
     /// has it too, about the best surface that was made. A fit and a sensitivity have reports of their own.
     // kept as a value, so that records of another version can still be shown
-    #[schema(value_type = Option<crate::measure::AnyReport>)]
+    #[schema(value_type = Option<Metrics>)]
     pub metrics: Option<serde_json::Value>,
     /// What it made. A job that failed because no surface passed keeps the best one, marked as not certified.
     pub outputs: Vec<Output>,
