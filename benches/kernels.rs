@@ -36,15 +36,7 @@ fn network(widths: &[usize], activation: Activation) -> Network {
         previous = outputs;
         layer
     };
-    Network {
-        layers: (0..=widths.len()).map(layer).collect(),
-        encoding: Encoding::Identity,
-        latent_size: 0,
-        latent_codes: Vec::new(),
-        domain: Domain::default(),
-        metric: Metric::Bound,
-        lipschitz: None,
-    }
+    Network::of_layers((0..=widths.len()).map(layer).collect())
 }
 
 /// Seconds of one product of cubes on one thread.

@@ -21,8 +21,8 @@ pub use spec::{FitSpec, Sampling};
 
 use crate::field::mesh::MeshField;
 use crate::field::network::adjoint::{Asked, Prepared, Sums};
-use crate::field::network::{Activation, Encoding, Layer, Network, Skip};
-use crate::field::{Domain, Field, Metric, Points};
+use crate::field::network::{Activation, Layer, Network, Skip};
+use crate::field::{Domain, Field, Points};
 use crate::measure::sampling::Splitmix;
 use crate::settings::{Canceled, Progress, Settings};
 use adam::Adam;
@@ -189,15 +189,7 @@ fn untrained(spec: &FitSpec, shapes: usize) -> Network {
     let reach = 0.1 / (latent_size.max(1) as f64).sqrt();
     let latent_codes =
         (0..rows * latent_size).map(|_| ((2.0 * random.unit() - 1.0) * 3f64.sqrt() * reach) as f32).collect();
-    Network {
-        layers,
-        encoding: Encoding::Identity,
-        latent_size,
-        latent_codes,
-        domain: Domain::default(),
-        metric: Metric::Bound,
-        lipschitz: None,
-    }
+    Network { latent_size, latent_codes, ..Network::of_layers(layers) }
 }
 
 /// What one thread works with: points of one shape, and the sums over them.
