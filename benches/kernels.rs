@@ -6,8 +6,8 @@
 //! ```
 
 use rayon::prelude::*;
-use shrinkd::field::network::{Activation, Encoding, Layer, Network};
-use shrinkd::field::{Domain, Field, Gradients, Metric, Points};
+use shrinkd::field::network::{Activation, Layer, Network};
+use shrinkd::field::{Field, Gradients, Points};
 use std::time::Instant;
 
 const POINTS: usize = 20_000;
