@@ -85,11 +85,14 @@ struct Repair<'a> {
     /// Farthest that a vertex may be from the zero level set.
     limit: f64,
     random: Random,
+    /// Random places that are tried for a vertex.
+    tries: usize,
 }
 
 /// Repairs a surface in scene units. `earlier` are positions that its vertices had before, any of which they may go back
 /// to. Triangles at `places` are shown to the field even if their corners do not doubt them. On return all positions are
-/// single-precision numbers. Another `seed` tries other places. Returns what is left.
+/// single-precision numbers. Another `seed` tries other places, and a larger one more of them: what earlier repairs left is
+/// hard. Returns what is left.
 pub fn separate(
     sampler: &Sampler<'_>,
     wrap: &mut Wrap,
@@ -106,6 +109,9 @@ pub fn separate(
     const FEWEST: usize = 1000;
     /// With more wrong triangles than this a cycle that brings nothing is the last.
     const MANY: usize = 60;
+    /// Random places for a vertex in the first repair, and how often they are doubled at most.
+    const TRIES: usize = 16;
+    const DOUBLINGS: u32 = 5;
     let positions: Vec<DVec3> = wrap.positions.iter().map(|&p| written(p)).collect();
     let at = OnZero { positions, values: wrap.values.clone(), gradients: wrap.gradients.clone() };
     let triangles = wrap.lattice.triangles(&wrap.diagonals);
@@ -121,6 +127,7 @@ pub fn separate(
         state: State { at, diagonals: wrap.diagonals.clone(), triangles, along, targets },
         limit: OFF * diagonal,
         random: Random::new(seed),
+        tries: TRIES << seed.min(DOUBLINGS),
     };
     repair.look_at(places)?;
     let mut found = repair.find()?;

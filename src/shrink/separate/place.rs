@@ -10,7 +10,6 @@ impl Repair<'_> {
     pub(super) fn place(&mut self, v: u32, earlier: &[&[DVec3]]) -> Result<(), Canceled> {
         /// Places shown to the field.
         const SHOWN: usize = 3;
-        const RANDOM_PLACES: usize = 16;
         let star: Vec<u32> = self.corners.at(v).iter().map(|&c| c / 3).collect();
         let here = self.state.at.positions[v as usize];
         let mut around: Vec<DVec3> = Vec::with_capacity(star.len());
@@ -28,7 +27,7 @@ impl Repair<'_> {
         places.extend([0.5, 1.0].map(|t| here + t * tangential));
         places.extend(around.iter().map(|&p| here.lerp(p, 0.4)));
         places.extend([-0.5, -0.25, -0.1, 0.1, 0.25, 0.5].map(|t| here + t * edge * normal));
-        for _ in 0..RANDOM_PLACES {
+        for _ in 0..self.tries {
             let reach = [0.1, 0.3, 0.7][self.random.below(3)] * edge;
             places.push(here + (reach * self.random.normal()).clamp_length_max(edge));
         }
