@@ -170,17 +170,18 @@ async fn wrapped(app: &App, file: &str, members: Value) -> (Value, Value) {
 async fn a_network_gives_the_same_surface_from_pytorch_as_from_our_own_format_once_it_is_said_what_no_file_says() {
     let folder = tempfile::tempdir().expect("folder");
     let app = App::start(folder.path());
-    for (own, theirs, family, members, said) in [
+    for (own, theirs, family, members, mut said) in [
         ("blob.safetensors", "families/blob_siren.pth", "siren", json!({}), json!({"w0": 12.0})),
         (
             "morph.safetensors",
-            "families/morph_igr.pth",
-            "igr",
+            "families/morph_deep_sdf.pth",
+            "deep_sdf_struct",
             json!({"latent_row": 2}),
-            json!({"latent_row": 2, "activation": {"softplus": {"beta": 20.0}}}),
+            json!({"latent_row": 2, "activation": {"softplus": {"beta": 100.0}}}),
         ),
     ] {
-        let (_, ours) = wrapped(&app, own, members).await;
+        let (description, ours) = wrapped(&app, own, members).await;
+        said["domain"] = description["domain"].clone();
         let (description, job) = wrapped(&app, theirs, said).await;
         assert_eq!((&description["format"], &description["family"]), (&json!("torch"), &json!(family)));
         assert!(description["assumed"].as_array().is_some_and(|list| !list.is_empty()), "{description}");

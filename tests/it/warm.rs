@@ -4,6 +4,7 @@ use crate::app::{App, BINARY, fixture, problem, small, state};
 use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
 use shrinkd::field::mesh::ChartedMesh;
+use shrinkd::field::network::safetensors;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
@@ -13,9 +14,16 @@ async fn network(app: &App) -> Value {
     response.json::<Value>().await.expect("JSON")["id"].clone()
 }
 
-/// A job of the network with this code.
-fn request(input: &Value, latent: [f32; 2]) -> Value {
-    json!({"field": {"input": input, "latent": latent}, "shrink": {"lattice": {"octahedral": {"n": 36}}},
+/// The code that is so much of the way from row 0 to row 1.
+fn code(share: f32) -> Vec<f32> {
+    let network = safetensors::read(&fixture("networks/morph.safetensors")).expect("a network");
+    let (from, to) = (network.latent_code(0).expect("a code"), network.latent_code(1).expect("a code"));
+    from.iter().zip(to).map(|(a, b)| a + share * (b - a)).collect()
+}
+
+/// A job of the network with the code at this share of the way.
+fn request(input: &Value, share: f32) -> Value {
+    json!({"field": {"input": input, "latent": code(share)}, "shrink": {"lattice": {"octahedral": {"n": 36}}},
            "outputs": ["glb", "surface", "report"]})
 }
 
@@ -33,11 +41,11 @@ async fn a_code_nearby_begins_from_the_surface_before_and_keeps_its_charts() {
     let folder = tempfile::tempdir().expect("folder");
     let app = App::start(folder.path());
     let input = network(&app).await;
-    let first = app.submit(&request(&input, [-1.0, -1.0])).await;
+    let first = app.submit(&request(&input, 0.0)).await;
     let cold = app.ended(&first).await;
     assert_eq!(state(&cold), "succeeded", "{cold}");
     assert_eq!(cold["metrics"]["warm_start"], json!(null));
-    let second = app.submit(&from(request(&input, [-0.9, -0.95]), &first)).await;
+    let second = app.submit(&from(request(&input, 0.05), &first)).await;
     let warm = app.ended(&second).await;
     assert_eq!(state(&warm), "succeeded", "{warm}");
     let told = &warm["metrics"]["warm_start"];
@@ -59,11 +67,11 @@ async fn the_earlier_job_may_be_forgotten_while_the_later_one_waits() {
     let folder = tempfile::tempdir().expect("folder");
     let app = App::start_with(folder.path(), &[("SHRINKD_WORKER__SLOTS", "1")]);
     let input = network(&app).await;
-    let first = app.submit(&request(&input, [-1.0, -1.0])).await;
+    let first = app.submit(&request(&input, 0.0)).await;
     assert_eq!(state(&app.ended(&first).await), "succeeded");
     let blocking = app.submit(&crate::app::endless()).await;
     app.running(&blocking).await;
-    let body = from(request(&input, [-0.95, -1.0]), &first);
+    let body = from(request(&input, 0.03), &first);
     let submit = || app.request(Method::POST, "/v1/jobs").header("Idempotency-Key", "again").json(&body).send();
     let accepted = submit().await.expect("an answer");
     assert_eq!(accepted.status(), StatusCode::ACCEPTED);
@@ -169,7 +177,7 @@ fn the_command_line_begins_from_a_surface_that_it_wrote() {
     let folder = tempfile::tempdir().expect("folder");
     let path = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
     let net = networks().join("morph.safetensors").to_string_lossy().into_owned();
-    std::fs::write(path("near.json"), "[-0.95, -1.0]").expect("writes");
+    std::fs::write(path("near.json"), format!("{:?}", code(0.03))).expect("writes");
     let (out, surface, report) = (path("out.glb"), path("s.safetensors"), path("r.json"));
     let extract =
         |further: &[&str]| run(&[&["extract", &net, "-o", &out, "--lattice", "octahedral:36"], further].concat());
@@ -196,7 +204,8 @@ fn a_way_through_latent_space_is_one_glb() {
     let folder = tempfile::tempdir().expect("folder");
     let path = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
     let net = networks().join("morph.safetensors").to_string_lossy().into_owned();
-    std::fs::write(path("way.json"), r#"{"from": 0, "to": [-0.6, -1], "frames": 4}"#).expect("writes");
+    let end = code(0.2);
+    std::fs::write(path("way.json"), format!(r#"{{"from": 0, "to": {end:?}, "frames": 4}}"#)).expect("writes");
     let (latents, out, report) = (path("way.json"), path("way.glb"), path("way.report.json"));
     let animate = |threads: &str| {
         let arguments = ["animate", &net, "--latents", &latents, "-o", &out, "--report", &report, "--fps", "4"];
@@ -214,8 +223,8 @@ fn a_way_through_latent_space_is_one_glb() {
     let report: Value = serde_json::from_slice(&std::fs::read(&report).expect("reads")).expect("JSON");
     let frames = report["frames"].as_array().expect("a list");
     assert_eq!((frames.len(), &report["passed"]), (4, &json!(true)));
-    assert_eq!(frames[3]["latent"][1], -1.0);
     let number = |value: &Value| value.as_f64().expect("a number");
+    assert_eq!(number(&frames[3]["latent"][1]) as f32, end[1]);
     for frame in &frames[1..] {
         assert_eq!((&frame["warm"], &frame["passed"], &frame["between"]), (&json!(true), &json!(true), &json!(0)));
         let (cost, first) = (number(&frame["evaluations_per_vertex"]), number(&frames[0]["evaluations_per_vertex"]));

@@ -255,12 +255,14 @@ put("neus", m, saved({"nerf": {"alpha_linear.weight": torch.zeros(1, 4)}, "sdf_n
 m = Implicit(0, 24, 0, False)
 put("igr", m, saved({"epoch": 5, "model_state_dict": module(m)}), expected="igr")
 
-# two of the repository's own networks as others would have saved them, for extractions: their beta and w0 are not the usual
+# two of the repository's own networks as others would have saved them, for extractions: their activation and w0 are not the usual
 from safetensors.torch import load_file  # noqa: E402
 
 OWN = pathlib.Path(__file__).resolve().parent.parent / "fixtures" / "networks"
 morph, blob = load_file(OWN / "morph.safetensors"), load_file(OWN / "blob.safetensors")
 state = {f"module.lin{name.removeprefix('layers.')}": v for name, v in morph.items() if name.startswith("layers.")}
-(OUT / "morph_igr.pth").write_bytes(saved({"model_state_dict": state, "lat_vecs": {"weight": morph["latent_codes"]}}))
+state["module.homogen_network.scale"] = torch.ones(1)
+codes = {"weight": morph["latent_codes"]}
+(OUT / "morph_deep_sdf.pth").write_bytes(saved({"model_state_dict": state, "lat_vecs": codes}))
 state = {f"net.net.{k.split('.')[1]}.0.{k.split('.')[2]}": v for k, v in blob.items()}
 (OUT / "blob_siren.pth").write_bytes(saved(state, legacy=True))

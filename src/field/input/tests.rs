@@ -45,8 +45,9 @@ fn networks_are_opened_with_their_latent_code() {
     assert!(at(&*blob, [0.0, -0.15, 0.0]).0 < -0.3 && at(&*blob, [0.9, 0.9, 0.9]).0 > 0.3);
     let morph = fixture("morph.safetensors");
     let by_row = open(&morph, &options(serde_json::json!({"latent_row": 1}))).unwrap();
-    let by_code = open(&morph, &options(serde_json::json!({"latent": [1.0, -1.0]}))).unwrap();
-    let other = open(&morph, &options(serde_json::json!({"latent": [-1.0, 0.5]}))).unwrap();
+    let code = crate::field::network::safetensors::read(&morph).unwrap().latent_code(1).unwrap().to_vec();
+    let by_code = open(&morph, &options(serde_json::json!({"latent": code}))).unwrap();
+    let other = open(&morph, &options(serde_json::json!({"latent": [code[0], -code[1]]}))).unwrap();
     let p = [0.4, 0.1, -0.2];
     assert_eq!(at(&*by_row, p), at(&*by_code, p));
     assert_ne!(at(&*by_row, p), at(&*other, p));
