@@ -1,19 +1,30 @@
 //! What networks cost: microseconds per point for value and gradient, and how near that is to the peak of the `gemm` crate on a product of
-//! 2048-cubes, in one run and turn by turn. Where `python3` (or what `PYTHON` names) has JAX or ONNX Runtime, theirs are printed beside.
+//! 2048-cubes, in one run. Where `python3` (or what `PYTHON` names) has JAX or ONNX Runtime, theirs are printed beside.
 //!
 //! ```sh
 //! cargo bench --bench kernels
+//! NETWORKS=one.safetensors:folder_of_deep_sdf cargo bench --bench kernels -- one
 //! ```
+//!
+//! Networks of random weights are evaluated at random points. A network from a file is evaluated at the vertices of its own surface, in their
+//! order, which is what an extraction does. Criterion prints what it always prints; the table below it has the least times of all its samples.
 
+use criterion::{BenchmarkId, Criterion, Throughput};
 use rayon::prelude::*;
-use shrinkd::field::network::{Activation, Layer, Network};
-use shrinkd::field::{Field, Gradients, Points};
-use std::time::Instant;
+use shrinkd::field::input::{self, FieldOptions};
+use shrinkd::field::network::{Activation, Layer, Network, NetworkField, folder};
+use shrinkd::field::sampler::Tally;
+use shrinkd::field::{Field, Gradients, Points, Sampler};
+use shrinkd::settings::{CancelToken, Settings};
+use shrinkd::shrink::lattice::LatticeSpec;
+use shrinkd::shrink::{Effort, ShrinkSpec, shrink};
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
 
 const POINTS: usize = 20_000;
 /// Points of a batch, as the sampler makes them.
 const BATCH: usize = 512;
-const ROUNDS: usize = 7;
 const CUBE: usize = 2048;
 
 /// A network of these widths with weights that keep the signal's size.
@@ -39,76 +50,156 @@ fn network(widths: &[usize], activation: Activation) -> Network {
     Network::of_layers((0..=widths.len()).map(layer).collect())
 }
 
-/// Seconds of one product of cubes on one thread.
-fn product(a: &[f32], b: &[f32], to: &mut [f32]) -> f64 {
-    let (n, step, start) = (CUBE, CUBE as isize, Instant::now());
+/// What is evaluated, and where.
+struct Case {
+    name: String,
+    field: NetworkField,
+    weights: usize,
+    places: [Vec<f32>; 3],
+}
+
+impl Case {
+    fn random(name: &str, widths: &[usize], activation: Activation) -> Self {
+        let axis = |k: usize| (0..POINTS).map(|i| ((i * k) % 1009) as f32 / 504.5 - 1.0).collect();
+        let network = network(widths, activation);
+        let field = network.field(&[]).expect("a network without a code");
+        Self::new(name.to_owned(), &network, field, [7919, 104_729, 1_299_709].map(axis))
+    }
+
+    fn new(name: String, network: &Network, field: NetworkField, places: [Vec<f32>; 3]) -> Self {
+        Self { name, field, weights: network.layers.iter().map(|l| l.weights.len()).sum(), places }
+    }
+
+    /// A network of any file, or of a folder of DeepSDF, at the vertices of its (first) surface.
+    fn of_file(path: &str, pool: &rayon::ThreadPool) -> Result<Self, String> {
+        let said = |e: &dyn std::fmt::Display| format!("{path}: {e}");
+        let at = std::path::Path::new(path);
+        let bytes = if at.is_dir() { folder::pack(at) } else { std::fs::read(at) }.map_err(|e| said(&e))?;
+        let first_row = FieldOptions { latent_row: Some(0), ..FieldOptions::default() };
+        let (placed, _) = input::open_network(&bytes, &first_row)
+            .or_else(|_| input::open_network(&bytes, &FieldOptions::default()))
+            .map_err(|e| said(&e))?;
+        let (cancel, tally, field) = (CancelToken::new(), Tally::new(), placed.field());
+        let sampler = Sampler::new(&field, Settings { pool, cancel: &cancel, progress: &|_| {} }, &tally);
+        let spec = ShrinkSpec { lattice: LatticeSpec::Octahedral { n: 72 }, ..ShrinkSpec::default() };
+        let surface = shrink(&sampler, &spec, None, &Effort::default()).map_err(|e| said(&e))?;
+        let places = [0, 1, 2].map(|axis| surface.positions.iter().map(|p| p[axis] as f32).collect());
+        let name = at.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        Ok(Self::new(name, &placed.network, placed.field(), places))
+    }
+
+    fn points(&self) -> usize {
+        self.places[0].len()
+    }
+
+    /// Evaluates all points on the pool, with gradients where there is room for them.
+    fn evaluate(&self, pool: &rayon::ThreadPool, values: &mut [f32], gradients: Option<&mut [Vec<f32>; 3]>) {
+        let [x, y, z] = &self.places;
+        let places = x.par_chunks(BATCH).zip(y.par_chunks(BATCH)).zip(z.par_chunks(BATCH));
+        let work = places.zip(values[..self.points()].par_chunks_mut(BATCH));
+        pool.install(|| match gradients {
+            None => work.for_each(|(((x, y), z), v)| self.field.values(Points { x, y, z }, v)),
+            Some([x, y, z]) => {
+                let slopes = x.par_chunks_mut(BATCH).zip(y.par_chunks_mut(BATCH)).zip(z.par_chunks_mut(BATCH));
+                work.zip(slopes).for_each(|((((x, y), z), v), ((gx, gy), gz))| {
+                    self.field.gradients(Points { x, y, z }, v, Gradients { x: gx, y: gy, z: gz });
+                });
+            }
+        });
+    }
+}
+
+/// One product of cubes on one thread.
+fn product(a: &[f32], b: &[f32], to: &mut [f32]) {
+    let (n, step) = (CUBE, CUBE as isize);
     assert!([a.len(), b.len(), to.len()].iter().all(|&length| length == n * n));
     // SAFETY: the three slices are CUBE x CUBE matrices at these strides, and `to` overlaps none of the others.
     unsafe {
         let (a, b, to, one) = (a.as_ptr(), b.as_ptr(), to.as_mut_ptr(), gemm::Parallelism::None);
         gemm::gemm(n, n, n, to, 1, step, false, a, 1, step, b, 1, step, 0.0, 1.0, false, false, false, one);
     }
-    start.elapsed().as_secs_f64()
 }
 
-fn main() {
-    let threads = std::thread::available_parallelism().map_or(1, |n| n.get());
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
-    let axis = |k: usize| (0..POINTS).map(|i| ((i * k) % 1009) as f32 / 504.5 - 1.0).collect::<Vec<f32>>();
-    let (x, y, z) = (axis(7919), axis(104_729), axis(1_299_709));
-    let [mut values, mut gx, mut gy, mut gz] = [0; 4].map(|_| vec![0.0f32; POINTS]);
-    let (a, b) = (vec![0.5f32; CUBE * CUBE], vec![0.25f32; CUBE * CUBE]);
-    let mut to = vec![0.0f32; CUBE * CUBE];
-    let nets = [
-        ("SIREN 4x256", vec![256; 4], Activation::Sine { w0: 30.0 }),
-        ("DeepSDF 8x512", vec![512; 8], Activation::Relu),
-        ("ELU 8x64", vec![64; 8], Activation::Elu),
-        ("IDR 8x256", vec![256; 8], Activation::Softplus { beta: 100.0 }),
-    ];
-    println!("value and gradient, the best of {ROUNDS} rounds over {POINTS} points");
-    println!(
-        "| network | us/point, one thread | GFLOP/s | of gemm's peak | us/point, {threads} threads | value only, {threads} threads |"
-    );
-    println!("|---|---:|---:|---:|---:|---:|");
-    for (name, widths, activation) in nets {
-        let network = network(&widths, activation);
-        let field = network.field(&[]).expect("no latent code");
-        // two operations per weight forward and two back
-        let operations: f64 = network.layers.iter().map(|l| 4.0 * l.weights.len() as f64).sum();
-        let (mut cube, mut one, mut all, mut alone) = (f64::INFINITY, f64::INFINITY, f64::INFINITY, f64::INFINITY);
-        for _ in 0..ROUNDS {
-            cube = cube.min(product(&a, &b, &mut to));
+/// The least seconds of every benchmark that ran.
+#[derive(Default)]
+struct Least(RefCell<BTreeMap<(String, &'static str), f64>>);
+
+impl Least {
+    /// Times `work` so many times, as criterion wants it, and keeps the least.
+    fn time(&self, name: &str, mode: &'static str, rounds: u64, mut work: impl FnMut()) -> Duration {
+        let mut all = Duration::ZERO;
+        for _ in 0..rounds {
             let start = Instant::now();
-            for s in (0..POINTS).step_by(BATCH) {
-                let r = s..(s + BATCH).min(POINTS);
-                let points = Points { x: &x[r.clone()], y: &y[r.clone()], z: &z[r.clone()] };
-                let into = Gradients { x: &mut gx[r.clone()], y: &mut gy[r.clone()], z: &mut gz[r.clone()] };
-                field.gradients(points, &mut values[r], into);
-            }
-            one = one.min(start.elapsed().as_secs_f64());
-            let places = x.par_chunks(BATCH).zip(y.par_chunks(BATCH)).zip(z.par_chunks(BATCH));
-            let start = Instant::now();
-            pool.install(|| {
-                let slopes = gx.par_chunks_mut(BATCH).zip(gy.par_chunks_mut(BATCH)).zip(gz.par_chunks_mut(BATCH));
-                places.clone().zip(values.par_chunks_mut(BATCH)).zip(slopes).for_each(
-                    |((((x, y), z), v), ((gx, gy), gz))| {
-                        field.gradients(Points { x, y, z }, v, Gradients { x: gx, y: gy, z: gz });
-                    },
-                );
-            });
-            all = all.min(start.elapsed().as_secs_f64());
-            let start = Instant::now();
-            pool.install(|| {
-                places
-                    .zip(values.par_chunks_mut(BATCH))
-                    .for_each(|(((x, y), z), v)| field.values(Points { x, y, z }, v));
-            });
-            alone = alone.min(start.elapsed().as_secs_f64());
+            work();
+            let taken = start.elapsed();
+            all += taken;
+            let mut least = self.0.borrow_mut();
+            let kept = least.entry((name.to_owned(), mode)).or_insert(f64::INFINITY);
+            *kept = kept.min(taken.as_secs_f64());
         }
-        let micros = |seconds: f64| seconds * 1e6 / POINTS as f64;
-        let (speed, peak) = (operations * POINTS as f64 / one, 2.0 * (CUBE as f64).powi(3) / cube);
+        all
+    }
+
+    fn seconds(&self, name: &str, mode: &'static str) -> Option<f64> {
+        self.0.borrow().get(&(name.to_owned(), mode)).copied()
+    }
+}
+
+const ONE: &str = "value and gradient, one thread";
+const ALL: &str = "value and gradient, all threads";
+const ALONE: &str = "value, all threads";
+
+fn main() {
+    let mut criterion = Criterion::default().sample_size(10).configure_from_args();
+    let threads = std::thread::available_parallelism().map_or(1, |n| n.get());
+    let [one, all] = [1, threads].map(|n| rayon::ThreadPoolBuilder::new().num_threads(n).build().expect("threads"));
+    let mut cases = vec![
+        Case::random("SIREN 4x256", &[256; 4], Activation::Sine { w0: 30.0 }),
+        Case::random("DeepSDF 8x512", &[512; 8], Activation::Relu),
+        Case::random("ELU 8x64", &[64; 8], Activation::Elu),
+        Case::random("IDR 8x256", &[256; 8], Activation::Softplus { beta: 100.0 }),
+    ];
+    for path in std::env::var("NETWORKS").iter().flat_map(|list| list.split(':')).filter(|path| !path.is_empty()) {
+        match Case::of_file(path, &all) {
+            Ok(case) => cases.push(case),
+            Err(fault) => println!("left out: {fault}"),
+        }
+    }
+    let least = Least::default();
+    let (a, b, mut to) = (vec![0.5; CUBE * CUBE], vec![0.25; CUBE * CUBE], vec![0.0; CUBE * CUBE]);
+    let largest = cases.iter().map(Case::points).max().unwrap_or(0);
+    let (mut values, mut gradients) = (vec![0.0; largest], [0; 3].map(|_| vec![0.0; largest]));
+    for case in &cases {
+        let mut group = criterion.benchmark_group(&case.name);
+        // beside every network, so that both see the same machine
+        group.bench_function(BenchmarkId::new("gemm", CUBE), |bencher| {
+            bencher.iter_custom(|rounds| least.time(&case.name, "gemm", rounds, || product(&a, &b, &mut to)));
+        });
+        group.throughput(Throughput::Elements(case.points() as u64));
+        for (mode, pool, slopes) in [(ONE, &one, true), (ALL, &all, true), (ALONE, &all, false)] {
+            group.bench_function(mode, |bencher| {
+                bencher.iter_custom(|rounds| {
+                    let work = || case.evaluate(pool, &mut values, slopes.then_some(&mut gradients));
+                    least.time(&case.name, mode, rounds, work)
+                });
+            });
+        }
+    }
+    criterion.final_summary();
+
+    println!("| network | points | us/point, one thread | GFLOP/s | of gemm's peak | us/point, {threads} threads | value only |");
+    println!("|---|---:|---:|---:|---:|---:|---:|");
+    for case in &cases {
+        let seconds = ["gemm", ONE, ALL, ALONE].map(|mode| least.seconds(&case.name, mode));
+        let [Some(cube), Some(one), Some(all), Some(alone)] = seconds else { continue };
+        let micros = |seconds: f64| seconds * 1e6 / case.points() as f64;
+        // two operations per weight forward and two back
+        let speed = (4 * case.weights * case.points()) as f64 / one;
+        let peak = 2.0 * (CUBE as f64).powi(3) / cube;
         println!(
-            "| {name} | {:.2} | {:.0} | {:.0} % of {:.0} | {:.2} | {:.2} |",
+            "| {} | {} | {:.2} | {:.0} | {:.0} % of {:.0} | {:.2} | {:.2} |",
+            case.name,
+            case.points(),
             micros(one),
             speed / 1e9,
             100.0 * speed / peak,

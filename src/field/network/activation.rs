@@ -52,6 +52,11 @@ impl Activation {
         }
     }
 
+    /// Whether a good part of all numbers have zero for the activation, and for its derivative.
+    pub(super) fn has_zeros(self) -> bool {
+        matches!(self, Self::Relu | Self::Softplus { .. })
+    }
+
     /// Replaces every number by its activation.
     pub(super) fn apply(self, row: &mut [f32]) {
         self.widest(row, None);

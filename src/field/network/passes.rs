@@ -41,7 +41,7 @@ impl Packed {
     /// Packs the weights of a network that was checked.
     pub fn new(network: &Network) -> Self {
         let point = network.encoding.size();
-        let mut previous = 0;
+        let (mut previous, mut zeros) = (0, false);
         let layers: Vec<Prepared> = network
             .layers
             .iter()
@@ -54,13 +54,15 @@ impl Packed {
                 let of_point = |row: usize, column: usize| weight(row, previous + network.latent_size + column);
                 let prepared = Prepared {
                     outputs: padded(outputs),
-                    from_previous: Panels::new(outputs, previous, weight),
+                    from_previous: Panels::new(outputs, previous, weight).of_zeros(zeros),
                     from_point: Panels::new(outputs, seen, of_point),
-                    to_previous: Panels::new(previous, if i == 0 { 0 } else { outputs }, |i, j| weight(j, i)),
-                    to_point: Panels::new(point, if seen > 0 { outputs } else { 0 }, |i, j| of_point(j, i)),
+                    to_previous: Panels::new(previous, if i == 0 { 0 } else { outputs }, |i, j| weight(j, i))
+                        .of_zeros(layer.activation.has_zeros()),
+                    to_point: Panels::new(point, if seen > 0 { outputs } else { 0 }, |i, j| of_point(j, i))
+                        .of_zeros(layer.activation.has_zeros()),
                     activation: layer.activation,
                 };
-                previous = outputs;
+                (previous, zeros) = (outputs, layer.activation.has_zeros());
                 prepared
             })
             .collect();

@@ -7,6 +7,12 @@
 //!
 //! Every sum is made in the order of the columns with fused multiply-adds, by every version of the kernel: a point gets the same
 //! bits in every tile, and on every processor that has the instruction.
+//!
+//! What comes out of a ReLU is often zero, for points that lie together in whole rows. Matrices of which that is known
+//! ([`Panels::of_zeros`]) are not multiplied with rows of nothing but zeros: the sums are the same without them, but for the sign of
+//! a sum that is zero.
+
+use std::cell::RefCell;
 
 /// Points in a tile: three registers of AVX-512.
 pub(super) const TILE: usize = 48;
@@ -25,6 +31,12 @@ pub(super) struct Panels {
     rows: usize,
     columns: usize,
     packed: Vec<f32>,
+    zeros: bool,
+}
+
+thread_local! {
+    /// The columns that count, one list per tile and matrix of a product.
+    static LIVE: RefCell<Vec<Vec<u32>>> = const { RefCell::new(Vec::new()) };
 }
 
 impl Panels {
@@ -36,12 +48,28 @@ impl Panels {
                 packed.extend((first..first + ROWS).map(|row| if row < rows { at(row, column) } else { 0.0 }));
             }
         }
-        Self { rows, columns, packed }
+        Self { rows, columns, packed, zeros: false }
+    }
+
+    /// Says whether rows of nothing but zeros are to be expected in what the matrix is multiplied with.
+    pub fn of_zeros(self, zeros: bool) -> Self {
+        Self { zeros, ..self }
     }
 
     /// Whether there is nothing to multiply with.
     pub fn is_empty(&self) -> bool {
         self.columns == 0
+    }
+
+    /// Lists the columns whose row in a tile is not zero from end to end, where it may be.
+    fn list_live(&self, tile: &[f32], live: &mut Vec<u32>) {
+        live.clear();
+        if self.zeros {
+            let rows = tile.chunks_exact(TILE).take(self.columns);
+            // one test of all numbers together, which the compiler makes a few wide instructions
+            let some = |row: &[f32]| row.iter().fold(0, |bits, x| bits | x.to_bits() << 1) != 0;
+            live.extend((0..).zip(rows).filter(|(_, row)| some(row)).map(|(column, _)| column));
+        }
     }
 
     fn panel(&self, index: usize) -> &[f32] {
@@ -74,27 +102,36 @@ pub(super) fn multiply(
     for (panels, from) in parts {
         assert!(padded(panels.rows) == rows && from.len() == tiles * padded(panels.columns) * TILE);
     }
-    let kernel = Kernel::detect();
-    for panel in 0..rows / ROWS {
-        for tile in 0..tiles {
-            let at = (tile * rows + panel * ROWS) * TILE;
-            let sums: &mut [f32; SUMS] = (&mut to[at..at + SUMS]).try_into().expect("a slice of that length");
-            match start {
-                Start::Zero => sums.fill(0.0),
-                Start::Bias(bias) => {
-                    for (row, bias) in sums.chunks_exact_mut(TILE).zip(&bias[panel * ROWS..]) {
-                        row.fill(*bias);
-                    }
-                }
-                Start::There => {}
+    LIVE.with_borrow_mut(|live| {
+        live.resize_with(live.len().max(parts.len() * tiles), Vec::new);
+        for ((panels, from), live) in parts.iter().zip(live.chunks_exact_mut(tiles)) {
+            for (from, live) in from.chunks_exact(padded(panels.columns) * TILE).zip(live) {
+                panels.list_live(from, live);
             }
-            for (panels, from) in parts {
-                let features = &from[tile * padded(panels.columns) * TILE..][..panels.columns * TILE];
-                kernel.add(panels.panel(panel), features, sums);
-            }
-            finish(at, sums);
         }
-    }
+        let kernel = Kernel::detect();
+        for panel in 0..rows / ROWS {
+            for tile in 0..tiles {
+                let at = (tile * rows + panel * ROWS) * TILE;
+                let sums: &mut [f32; SUMS] = (&mut to[at..at + SUMS]).try_into().expect("a slice of that length");
+                match start {
+                    Start::Zero => sums.fill(0.0),
+                    Start::Bias(bias) => {
+                        for (row, bias) in sums.chunks_exact_mut(TILE).zip(&bias[panel * ROWS..]) {
+                            row.fill(*bias);
+                        }
+                    }
+                    Start::There => {}
+                }
+                for (part, (panels, from)) in parts.iter().enumerate() {
+                    let features = &from[tile * padded(panels.columns) * TILE..][..panels.columns * TILE];
+                    let live = panels.zeros.then_some(live[part * tiles + tile].as_slice());
+                    kernel.add(panels.panel(panel), features, live, sums);
+                }
+                finish(at, sums);
+            }
+        }
+    });
 }
 
 /// Numbers of a matrix as [`outer`] sums it up: whole products of a panel's rows with a tile's.
@@ -141,7 +178,7 @@ pub(super) fn outer(
         for (part, across) in across.chunks_exact(points * TILE).enumerate() {
             let at = outer_place(rows, first, part * TILE);
             let sums: &mut [f32; SUMS] = (&mut to[at..at + SUMS]).try_into().expect("a slice of that length");
-            kernel.add(panel, across, sums);
+            kernel.add(panel, across, None, sums);
         }
     }
 }
@@ -154,6 +191,11 @@ fn turn(from: &[f32], rows: usize, width: usize, to: &mut [f32]) {
         }
     }
 }
+
+/// The columns of a product: [`ROWS`] weights and a row of points each.
+trait Columns<'a>: Iterator<Item = (&'a [f32; ROWS], &'a [f32; TILE])> + Clone {}
+
+impl<'a, I: Iterator<Item = (&'a [f32; ROWS], &'a [f32; TILE])> + Clone> Columns<'a> for I {}
 
 /// A version of the kernel that this processor can run.
 #[derive(Clone, Copy)]
@@ -179,31 +221,55 @@ impl Kernel {
         Self::Plain
     }
 
-    /// Adds the product of a panel with a tile's features to `sums`.
-    fn add(self, panel: &[f32], features: &[f32], sums: &mut [f32; SUMS]) {
-        assert_eq!(panel.len() / ROWS, features.len() / TILE);
+    /// Adds the product of a panel with a tile's features to `sums`, of the columns in `live` where there is such a list.
+    fn add(self, panel: &[f32], features: &[f32], live: Option<&[u32]>, sums: &mut [f32; SUMS]) {
+        let (panel, features) = (panel.as_chunks().0, features.as_chunks().0);
+        assert_eq!(panel.len(), features.len());
+        let block = self.block();
+        match live {
+            Some(live) if live.len() < panel.len() => live.chunks(block).for_each(|live| {
+                self.add_all(live.iter().map(|&k| (&panel[k as usize], &features[k as usize])), sums);
+            }),
+            _ => panel.chunks(block).zip(features.chunks(block)).for_each(|(panel, features)| {
+                self.add_all(panel.iter().zip(features), sums);
+            }),
+        }
+    }
+
+    /// Columns that are gone through at once. AVX2 has too few registers for all sums, so it comes back to the same columns: so
+    /// many of them (18 KiB) are still in the nearest cache then.
+    fn block(self) -> usize {
+        match self {
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2 => 96,
+            _ => usize::MAX,
+        }
+    }
+
+    #[inline(always)]
+    fn add_all<'a>(self, columns: impl Columns<'a>, sums: &mut [f32; SUMS]) {
         match self {
             // SAFETY: `detect` saw that the processor has the features that the function asks for.
             #[cfg(target_arch = "x86_64")]
-            Self::Avx512 => unsafe { add_avx512(panel, features, sums) },
+            Self::Avx512 => unsafe { add_avx512(columns, sums) },
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
-            Self::Avx2 => unsafe { add_avx2(panel, features, sums) },
-            Self::Plain => add_plain(panel, features, sums),
+            Self::Avx2 => unsafe { add_avx2(columns, sums) },
+            Self::Plain => add_plain(columns, sums),
         }
     }
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f")]
-fn add_avx512(panel: &[f32], features: &[f32], sums: &mut [f32; SUMS]) {
+fn add_avx512<'a>(columns: impl Columns<'a>, sums: &mut [f32; SUMS]) {
     use std::arch::x86_64::{__m512, _mm512_fmadd_ps, _mm512_loadu_ps, _mm512_set1_ps, _mm512_storeu_ps};
     const LANES: usize = 16;
     const WIDE: usize = TILE / LANES;
     // SAFETY: reads 16 numbers at most 16 before the end of a chunk of TILE or SUMS numbers.
     let load = |row: &[f32], j: usize| -> __m512 { unsafe { _mm512_loadu_ps(row[j * LANES..][..LANES].as_ptr()) } };
     let mut sum: [[__m512; WIDE]; ROWS] = std::array::from_fn(|i| std::array::from_fn(|j| load(&sums[i * TILE..], j)));
-    for (weights, points) in panel.chunks_exact(ROWS).zip(features.chunks_exact(TILE)) {
+    for (weights, points) in columns.clone() {
         let points: [__m512; WIDE] = std::array::from_fn(|j| load(points, j));
         for i in 0..ROWS {
             let weight = _mm512_set1_ps(weights[i]);
@@ -222,19 +288,20 @@ fn add_avx512(panel: &[f32], features: &[f32], sums: &mut [f32; SUMS]) {
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
-fn add_avx2(panel: &[f32], features: &[f32], sums: &mut [f32; SUMS]) {
+fn add_avx2<'a>(columns: impl Columns<'a>, sums: &mut [f32; SUMS]) {
     use std::arch::x86_64::{__m256, _mm256_fmadd_ps, _mm256_loadu_ps, _mm256_set1_ps, _mm256_storeu_ps};
     const LANES: usize = 8;
-    /// Of 16 registers, twelve hold sums of 4 rows and 24 points.
-    const WIDE: usize = 3;
+    /// Of 16 registers, eight hold sums of 4 rows and 16 points: with twelve the compiler has none left to load into, and
+    /// keeps a sum on the stack.
+    const WIDE: usize = 2;
     const HIGH: usize = 4;
     // SAFETY: reads the 8 numbers of a slice of that length.
     let load = |row: &[f32], j: usize| -> __m256 { unsafe { _mm256_loadu_ps(row[j * LANES..][..LANES].as_ptr()) } };
-    for first in (0..ROWS).step_by(HIGH) {
-        for left in (0..TILE).step_by(WIDE * LANES) {
+    for left in (0..TILE).step_by(WIDE * LANES) {
+        for first in (0..ROWS).step_by(HIGH) {
             let mut sum: [[__m256; WIDE]; HIGH] =
                 std::array::from_fn(|i| std::array::from_fn(|j| load(&sums[(first + i) * TILE + left..], j)));
-            for (weights, points) in panel.chunks_exact(ROWS).zip(features.chunks_exact(TILE)) {
+            for (weights, points) in columns.clone() {
                 let points: [__m256; WIDE] = std::array::from_fn(|j| load(&points[left..], j));
                 for i in 0..HIGH {
                     let weight = _mm256_set1_ps(weights[first + i]);
@@ -255,8 +322,8 @@ fn add_avx2(panel: &[f32], features: &[f32], sums: &mut [f32; SUMS]) {
 }
 
 /// For processors without these instructions: the same sums.
-fn add_plain(panel: &[f32], features: &[f32], sums: &mut [f32; SUMS]) {
-    for (weights, points) in panel.chunks_exact(ROWS).zip(features.chunks_exact(TILE)) {
+fn add_plain<'a>(columns: impl Columns<'a>, sums: &mut [f32; SUMS]) {
+    for (weights, points) in columns.clone() {
         for (weight, row) in weights.iter().zip(sums.chunks_exact_mut(TILE)) {
             for (sum, point) in row.iter_mut().zip(points) {
                 *sum = weight.mul_add(*point, *sum);
@@ -328,7 +395,7 @@ mod tests {
         let features: Vec<f32> = (0..columns * TILE).map(|i| number(i + 3)).collect();
         let with = |kernel: Kernel| {
             let mut sums: [f32; SUMS] = std::array::from_fn(number);
-            kernel.add(&panel, &features, &mut sums);
+            kernel.add(&panel, &features, None, &mut sums);
             sums
         };
         let plain = with(Kernel::Plain);

@@ -1,6 +1,5 @@
 use super::*;
 use crate::field::grid::npy;
-use crate::field::mesh::tests::thread_time;
 use crate::field::{Field, Gradients, Points};
 use proptest::prelude::*;
 use std::path::PathBuf;
@@ -354,44 +353,5 @@ proptest! {
         let at = at % head.len();
         head[at] = value;
         let _ = safetensors::read(&head);
-    }
-}
-
-/// Not a claim but a measure: `cargo test --release --lib network_speed -- --ignored --nocapture`.
-#[test]
-#[ignore = "prints times, claims nothing"]
-fn network_speed() {
-    let mut networks = vec![
-        ("elu 8x64".to_owned(), made(&[64; 8], Activation::Elu, Encoding::Identity, 0, None)),
-        ("siren 4x256".to_owned(), made(&[256; 4], Activation::Sine { w0: 30.0 }, Encoding::Identity, 0, None)),
-        ("relu 8x512".to_owned(), made(&[512; 8], Activation::Relu, Encoding::Identity, 0, None)),
-    ];
-    if let Some(bytes) = shared("neural-implicit-queries/bunny.npz") {
-        networks.insert(0, ("bunny.npz".to_owned(), niq::read(&bytes).unwrap()));
-    }
-    let all = points(512);
-    let column = |axis: usize| all.iter().map(|p| p[axis]).collect::<Vec<f32>>();
-    let (x, y, z) = (column(0), column(1), column(2));
-    let batch = Points { x: &x, y: &y, z: &z };
-    let mut values = vec![0.0; x.len()];
-    let (mut gx, mut gy, mut gz) = (values.clone(), values.clone(), values.clone());
-    for (name, network) in networks {
-        let field = network.field(&[]).unwrap();
-        // the thread's time is only brought up to date every few milliseconds
-        let repeats = 400_000_000 / (network.parameters() * x.len()) + 5;
-        let mut best = [f64::INFINITY; 2];
-        for _ in 0..5 {
-            let start = thread_time();
-            (0..repeats).for_each(|_| field.values(batch, &mut values));
-            best[0] = best[0].min((thread_time() - start) / repeats as f64);
-            let start = thread_time();
-            (0..repeats).for_each(|_| {
-                let gradients = Gradients { x: &mut gx, y: &mut gy, z: &mut gz };
-                field.gradients(batch, &mut values, gradients);
-            });
-            best[1] = best[1].min((thread_time() - start) / repeats as f64);
-        }
-        let [value, gradient] = best.map(|ns| ns / 1e3 / x.len() as f64);
-        println!("{name}: value {value:.2} us, value and gradient {gradient:.2} us a point of processor time");
     }
 }
