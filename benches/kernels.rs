@@ -187,7 +187,9 @@ fn main() {
     }
     criterion.final_summary();
 
-    println!("| network | points | us/point, one thread | GFLOP/s | of gemm's peak | us/point, {threads} threads | value only |");
+    println!(
+        "| network | points | us/point, one thread | GFLOP/s | of gemm's peak | us/point, {threads} threads | value only |"
+    );
     println!("|---|---:|---:|---:|---:|---:|---:|");
     for case in &cases {
         let seconds = ["gemm", ONE, ALL, ALONE].map(|mode| least.seconds(&case.name, mode));

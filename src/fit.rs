@@ -6,7 +6,7 @@
 //! learning rate that falls along a cosine.
 //!
 //! All shapes are brought to the cube of half extent 1 about their common center by one scale, and what was learned is brought back
-//! by the weights: the network answers in scene units. The same meshes and [`FitSpec`] give the same bits for any number of threads,
+//! by the weights: the network answers in scene units. With [`FitSpec::normalize`] every shape has a scale of its own before that. The same meshes and [`FitSpec`] give the same bits for any number of threads,
 //! also where training went on from a [`Checkpoint`].
 
 mod adam;
@@ -19,7 +19,8 @@ pub use checkpoint::Checkpoint;
 pub use report::{FitReport, ShapeReport};
 pub use spec::{FitSpec, Sampling};
 
-use crate::field::mesh::MeshField;
+use crate::field::input::Transform;
+use crate::field::mesh::{MeshField, TriangleMesh};
 use crate::field::network::adjoint::{Asked, Prepared, Sums};
 use crate::field::network::{Activation, Layer, Network, Skip};
 use crate::field::{Domain, Field, Points};
@@ -88,6 +89,9 @@ pub struct Training<'a> {
 pub fn fit(meshes: &[MeshField], training: Training<'_>, settings: &Settings<'_>) -> Result<Fitted, FitError> {
     assert!(!meshes.is_empty(), "there is a mesh to fit to");
     let spec = training.spec;
+    let (moved, back): (Vec<MeshField>, Vec<Transform>) =
+        if spec.normalize { meshes.iter().map(normalized).unzip() } else { (Vec::new(), Vec::new()) };
+    let meshes = if spec.normalize { &moved } else { meshes };
     let place = Place::of(meshes);
     let told = |progress: Progress| (settings.progress)(Progress { stage: "sample", ..progress });
     let quiet = Settings { progress: &told, ..*settings };
@@ -107,8 +111,20 @@ pub fn fit(meshes: &[MeshField], training: Training<'_>, settings: &Settings<'_>
     let mut network = state.network(spec, meshes.len());
     place.bring_back(&mut network);
     network.domain = place.domain;
-    let report = report::measure(&network, meshes, spec, &state.losses, settings)?;
+    let report = report::measure(&network, meshes, &back, spec, &state.losses, settings)?;
     Ok(Fitted { network, report })
+}
+
+/// A mesh in the cube of half extent 1 about its center, and what takes it back.
+fn normalized(mesh: &MeshField) -> (MeshField, Transform) {
+    let (low, high) = mesh.mesh().bounds();
+    let (low, high) = (DVec3::from(low), DVec3::from(high));
+    let (center, scale) = (0.5 * (low + high), 0.5 * (high - low).max_element());
+    let to_cube = |v: &[f64; 3]| ((DVec3::from(*v) - center) / scale).to_array();
+    let vertices = mesh.mesh().vertices.iter().map(to_cube).collect();
+    let moved = MeshField::new(TriangleMesh { vertices, triangles: mesh.mesh().triangles.clone() });
+    let moved = moved.unwrap_or_else(|e| unreachable!("it has the triangles of a mesh that was accepted: {e}"));
+    (moved, Transform { scale, translate: center.to_array(), ..Transform::default() })
 }
 
 /// Where the shapes lie: training takes place in the cube of half extent 1.

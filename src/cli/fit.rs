@@ -23,7 +23,7 @@ pub const EXAMPLES: &str = "\
 Examples:
   shrinkd fit spot.ply -o spot.safetensors
   shrinkd fit spot.ply -o spot.safetensors --checkpoint spot.checkpoint --report spot.json
-  shrinkd fit chairs/*.ply -o chairs.safetensors --latent-size 64 --layers 8 --width 256
+  shrinkd fit chairs/*.ply -o chairs.safetensors --latent-size 64 --layers 8 --width 256 --normalize
   shrinkd extract chairs.safetensors --latent-row 3 -o chair.glb
 
 Exits 0 when a network was written, 1 when training was interrupted or diverged, 2 on bad usage, 3 when a file is no mesh.";
@@ -61,6 +61,9 @@ pub struct FitArgs {
     /// Where the samples lie
     #[arg(long, value_enum, default_value_t = SamplingArg::Points)]
     pub sampling: SamplingArg,
+    /// Bring every mesh to one cube first; the report says how to come back
+    #[arg(long)]
+    pub normalize: bool,
     /// Samples of a step
     #[arg(long, value_name = "N", default_value_t = FitSpec::default().batch)]
     pub batch: u32,
@@ -135,6 +138,7 @@ impl FitArgs {
                 SamplingArg::Points => Sampling::Points,
                 SamplingArg::Grid => Sampling::Grid,
             },
+            normalize: self.normalize,
             batch: self.batch,
             learning_rate: self.learning_rate,
             normal: self.normal,

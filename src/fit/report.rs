@@ -2,6 +2,7 @@
 
 use super::FitSpec;
 use super::samples::around;
+use crate::field::input::Transform;
 use crate::field::mesh::MeshField;
 use crate::field::network::Network;
 use crate::field::sampler::Tally;
@@ -46,12 +47,16 @@ pub struct ShapeReport {
     pub closeness: Option<Closeness>,
     /// Components of that zero level set: more than the mesh has are specks that the network imagines.
     pub components: u64,
+    /// Where every mesh was brought to one cube (`normalize`): what takes the network's surface to its mesh, as the option `transform`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub transform: Option<Transform>,
 }
 
-/// Measures a network in scene units against its meshes.
+/// Measures a network against its meshes, which are in its units; `back` takes them to where they were, if they were moved.
 pub(super) fn measure(
     network: &Network,
     meshes: &[MeshField],
+    back: &[Transform],
     spec: &FitSpec,
     losses: &[f32],
     settings: &Settings<'_>,
@@ -61,7 +66,8 @@ pub(super) fn measure(
         let done = i as f32 / meshes.len() as f32;
         let fraction = super::TRAINED_SHARE + (1.0 - super::TRAINED_SHARE) * done;
         (settings.progress)(Progress { stage: "measure", fraction, ..Progress::default() });
-        shapes.push(shape(network, mesh, i, spec, settings)?);
+        let shape = shape(network, mesh, i, spec, settings)?;
+        shapes.push(ShapeReport { transform: back.get(i).copied(), ..shape });
     }
     Ok(FitReport {
         fit: *spec,
@@ -97,5 +103,5 @@ fn shape(
     let zeros = Mesh { vertices: &zeros.vertices, triangles: &zeros.triangles };
     let truth = Mesh { vertices: &vertices, triangles: &mesh.mesh().triangles };
     let closeness = between(zeros, truth, SAMPLES, &settings)?.map(|comparison| comparison.closeness);
-    Ok(ShapeReport { error, closeness, components })
+    Ok(ShapeReport { error, closeness, components, transform: None })
 }

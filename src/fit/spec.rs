@@ -40,6 +40,9 @@ pub struct FitSpec {
     pub samples: u32,
     /// Where the samples lie.
     pub sampling: Sampling,
+    /// Whether every mesh is first brought to the cube of half extent 1 about its own center. The network then answers in that
+    /// cube's units, and the report says how to come back.
+    pub normalize: bool,
     /// Samples of a step, from 384 to 262,144; the next multiple of 384 is taken.
     pub batch: u32,
     /// Learning rate at its highest, up to 1.
@@ -64,6 +67,7 @@ impl Default for FitSpec {
             epochs: 25,
             samples: 200_000,
             sampling: Sampling::Points,
+            normalize: false,
             batch: 6144,
             learning_rate: 1e-3,
             normal: 0.0,

@@ -95,6 +95,20 @@ fn several_balls_get_a_code_each() {
 }
 
 #[test]
+fn balls_of_all_sizes_are_learned_alike_when_each_is_brought_to_the_cube() {
+    let meshes = [ball([5.0, 0.0, 0.0], 40.0), ball([0.0, -3.0, 0.0], 0.1)];
+    let spec = FitSpec { latent_size: 4, width: 32, epochs: 40, normalize: true, ..small() };
+    let made = fitted(&meshes, &spec, 2);
+    for (shape, (center, radius)) in made.report.shapes.iter().zip([(5.0, 40.0), (0.0, 0.1)]) {
+        assert!(shape.closeness.unwrap().distance.mean < 0.01, "{shape:?}");
+        let back = shape.transform.unwrap();
+        assert!((back.scale / radius - 1.0).abs() < 1e-9 && (back.translate[0] - center).abs() < 1e-9, "{back:?}");
+    }
+    let domain = made.network.domain;
+    assert!(domain.min.iter().chain(&domain.max).all(|c| (1.0..1.5).contains(&c.abs())), "{domain:?}");
+}
+
+#[test]
 fn terms_of_the_gradient_bring_its_length_to_one() {
     let miss = |spec: &FitSpec| {
         let mesh = ball([0.0; 3], 1.0);

@@ -5,7 +5,7 @@
 Every model is built here from its published description (see src/field/network/family.rs), with random weights, and saved with
 torch.save in the layout of the family's own code. Beside NAME.pth (or NAME.zip, an experiment folder of DeepSDF) comes NAME.json: options,
 points, values and input gradients by autograd in double precision. The files in tests/fixtures/networks/families
-were written with 50 points; continuous integration writes them anew with 1,000.
+were written with 50 points; `.ci/run` writes them anew with 1,000.
 """
 
 import io
@@ -15,6 +15,7 @@ import pathlib
 import sys
 import zipfile
 
+import parametrized
 import torch
 from torch import nn
 
@@ -35,7 +36,7 @@ def linear(inputs, outputs, gain=1.0):
 
 
 def normed(layer, new):
-    norm = nn.utils.parametrizations.weight_norm if new else nn.utils.weight_norm
+    norm = parametrized.weight_norm if new else nn.utils.weight_norm
     layer = norm(layer)
     with torch.no_grad():
         (layer.parametrizations.weight.original0 if new else layer.weight_g).mul_(1.3)

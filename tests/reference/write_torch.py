@@ -17,6 +17,7 @@ import sys
 import warnings
 
 import numpy
+import parametrized
 import torch
 from torch import nn
 
@@ -175,7 +176,7 @@ def main(folder):
 
     decoder = nn.DataParallel(Decoder(nn.utils.weight_norm))
     save("deepsdf", {"epoch": 2000, "model_state_dict": decoder.state_dict()})
-    decoder = Decoder(nn.utils.parametrizations.weight_norm)
+    decoder = Decoder(parametrized.weight_norm)
     optimizer = trained(decoder)
     save(
         "parametrized",

@@ -1,6 +1,8 @@
 //! The file of latent codes that an animation goes through.
 
 use crate::field::FieldError;
+use crate::field::grid::npy;
+use crate::field::network::MAX_LATENT;
 use serde::Deserialize;
 
 /// Most frames of an animation: an hour and more of wrapping for any network, and what a GLB has room for.
@@ -37,12 +39,15 @@ enum Latents {
 ///
 /// # Errors
 /// What is wrong with the file, or with the entry that is named by its place.
-pub fn read(text: &[u8], code: impl Fn(&Entry) -> Result<Vec<f32>, FieldError>) -> Result<Vec<Vec<f32>>, String> {
-    let latents: Latents = serde_json::from_slice(text).map_err(|e| {
-        let expected =
-            "a list of latent codes or rows, or {\"from\": code or row, \"to\": code or row, \"frames\": number}";
-        format!("expected {expected} ({e})")
-    })?;
+pub fn read(bytes: &[u8], code: impl Fn(&Entry) -> Result<Vec<f32>, FieldError>) -> Result<Vec<Vec<f32>>, String> {
+    let latents: Latents = match npy::rows(bytes, MAX_FRAMES * MAX_LATENT) {
+        Some(rows) => Latents::Each(rows.map_err(|e| e.to_string())?.into_iter().map(Entry::Code).collect()),
+        None => serde_json::from_slice(bytes).map_err(|e| {
+            let expected = "a .npy array of latent codes, a list of latent codes or rows, \
+                            or {\"from\": code or row, \"to\": code or row, \"frames\": number}";
+            format!("expected {expected} ({e})")
+        })?,
+    };
     let frames = match &latents {
         Latents::Each(list) => list.len(),
         Latents::Between { frames, .. } => *frames,
@@ -86,6 +91,26 @@ mod tests {
     }
 
     #[test]
+    fn an_array_of_numpy_is_a_list_of_codes() {
+        let array = |shape: &str, numbers: &[f64]| {
+            let header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n");
+            let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
+            bytes.extend((header.len() as u16).to_le_bytes());
+            bytes.extend(header.as_bytes());
+            bytes.extend(numbers.iter().flat_map(|n| n.to_le_bytes()));
+            read(&bytes, |entry| match entry {
+                Entry::Code(code) => Ok(code.clone()),
+                Entry::Row(_) => Err(FieldError::Unsupported { detail: "a row".to_owned() }),
+            })
+        };
+        let codes = vec![vec![0.5, 1.0], vec![2.0, -1.0]];
+        assert_eq!(array("(2, 2)", &[0.5, 1.0, 2.0, -1.0]), Ok(codes.clone()));
+        assert_eq!(array("(2, 1, 2)", &[0.5, 1.0, 2.0, -1.0]), Ok(codes));
+        assert!(array("(4,)", &[0.5, 1.0, 2.0, -1.0]).is_err_and(|e| e.contains("shape [4]")));
+        assert!(array("(2, 2)", &[0.5]).is_err());
+    }
+
+    #[test]
     fn a_straight_way_meets_both_its_ends() {
         let way = codes(r#"{"from": [0.1, 0.7], "to": 2, "frames": 5}"#).expect("reads");
         assert_eq!((way.len(), &way[0], &way[4]), (5, &vec![0.1, 0.7], &vec![2.0, -1.0]));
@@ -97,12 +122,12 @@ mod tests {
         for (text, said) in [
             ("[[0, 0], 3]", "frame 1: unsupported: no such row"),
             (r#"{"from": 7, "to": 1, "frames": 2}"#, "from: "),
-            (r#"{"from": 0, "to": 1}"#, "expected a list"),
-            (r#"{"from": 0, "to": 1, "frames": 2, "fps": 3}"#, "expected a list"),
+            (r#"{"from": 0, "to": 1}"#, "expected a .npy array"),
+            (r#"{"from": 0, "to": 1, "frames": 2, "fps": 3}"#, "expected a .npy array"),
             ("[0]", "1 frames"),
             (r#"{"from": 0, "to": 1, "frames": 1001}"#, "2 to 1000"),
-            ("[0, -1]", "expected a list"),
-            ("nonsense", "expected a list"),
+            ("[0, -1]", "expected a .npy array"),
+            ("nonsense", "expected a .npy array"),
         ] {
             let found = codes(text).expect_err("is refused");
             assert!(found.contains(said), "{text}: {found}");

@@ -100,6 +100,24 @@ pub(in crate::field) fn header(bytes: &[u8], max_count: usize) -> Result<Header,
     Ok(Header { width, big_endian, fortran: parsed.fortran, shape: parsed.shape, body })
 }
 
+/// The rows of an array of shape `[rows, columns]` (or `[rows, 1, columns]`, which some code saves), in single precision; `None` when the
+/// bytes are no array at all.
+pub(crate) fn rows(bytes: &[u8], max_count: usize) -> Option<Result<Vec<Vec<f32>>, FieldError>> {
+    claims(bytes).then(|| {
+        let header = header(bytes, max_count)?;
+        let (rows, columns) = match header.shape[..] {
+            [rows, columns] | [rows, 1, columns] if columns > 0 => (rows, columns),
+            _ => {
+                let detail = format!("an array of shape {:?}, where rows of numbers are expected", header.shape);
+                return Err(FieldError::Unsupported { detail });
+            }
+        };
+        let at = |row: usize, column: usize| if header.fortran { column * rows + row } else { row * columns + column };
+        let number = |row, column| header.number(bytes, at(row, column)) as f32;
+        Ok((0..rows).map(|row| (0..columns).map(|column| number(row, column)).collect()).collect())
+    })
+}
+
 struct Parsed {
     descr: Vec<u8>,
     fortran: bool,
