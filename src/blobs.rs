@@ -1,87 +1,27 @@
-//! Inputs and outputs by the hash of their content, on `object_store`.
+//! Inputs and outputs by the hash of their content, on `object_store`: in a folder, or in a bucket that speaks S3.
 //!
-//! Guarantees: what [`Blobs::put`] returned is on the disk (file and folder synced) under its SHA-256 and never changes; a
-//! half-written blob is never visible. Not guaranteed: that a blob is still what it was after the folder was edited by hand;
-//! [`Blobs::get`] checks the hash, ranges do not.
+//! Guarantees: what [`Blobs::put`] returned is in the store (in a folder: file and folder synced) under its SHA-256 and never
+//! changes; a half-written blob is never visible; a blob that was put or touched is kept for [`Blobs::GRACE`] at least, whether or not
+//! anything names it. Not guaranteed: that a blob is still what it was after the store was edited by hand; [`Blobs::get`] checks
+//! the hash, ranges do not.
+
+mod id;
+mod place;
+
+pub use id::{BlobId, InvalidBlobId};
+pub use place::PlaceError;
 
 use bytes::Bytes;
 use futures::stream::BoxStream;
 use futures::{StreamExt, TryStreamExt};
-use object_store::local::LocalFileSystem;
+use jiff::Timestamp;
 use object_store::path::Path;
-use object_store::{GetOptions, GetRange, ObjectStore, ObjectStoreExt, PutMode, PutOptions};
-use sha2::{Digest, Sha256};
+use object_store::{GetOptions, GetRange, ObjectMeta, ObjectStore, ObjectStoreExt, PutMode, PutOptions};
+use place::Place;
 use std::ops::Range;
 use std::sync::Arc;
+use std::time::Duration;
 use tokio::sync::{OwnedRwLockReadGuard, OwnedRwLockWriteGuard, RwLock};
-
-/// Name of a blob: the SHA-256 of its bytes, written `sha256:` and 64 lower-case hexadecimal digits.
-#[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct BlobId([u8; 32]);
-
-impl BlobId {
-    /// The name of these bytes.
-    pub fn of(bytes: &[u8]) -> Self {
-        Self(Sha256::digest(bytes).into())
-    }
-    /// The name with these 64 hexadecimal digits.
-    pub fn from_hex(hex: &str) -> Option<Self> {
-        let digits = hex.as_bytes();
-        if digits.len() != 64 || digits.iter().any(|d| !matches!(d, b'0'..=b'9' | b'a'..=b'f')) {
-            return None;
-        }
-        let mut id = [0u8; 32];
-        for (byte, pair) in id.iter_mut().zip(digits.chunks_exact(2)) {
-            *byte = u8::from_str_radix(std::str::from_utf8(pair).ok()?, 16).ok()?;
-        }
-        Some(Self(id))
-    }
-    /// The 64 hexadecimal digits.
-    pub fn hex(&self) -> String {
-        self.0.iter().map(|b| format!("{b:02x}")).collect()
-    }
-    /// The 32 bytes of the hash.
-    pub fn bytes(&self) -> &[u8; 32] {
-        &self.0
-    }
-}
-
-impl std::fmt::Display for BlobId {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "sha256:{}", self.hex())
-    }
-}
-
-impl std::fmt::Debug for BlobId {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        std::fmt::Display::fmt(self, f)
-    }
-}
-
-impl std::str::FromStr for BlobId {
-    type Err = InvalidBlobId;
-    fn from_str(s: &str) -> Result<Self, InvalidBlobId> {
-        s.strip_prefix("sha256:").and_then(Self::from_hex).ok_or(InvalidBlobId)
-    }
-}
-
-impl serde::Serialize for BlobId {
-    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.collect_str(self)
-    }
-}
-
-impl<'de> serde::Deserialize<'de> for BlobId {
-    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let text = String::deserialize(deserializer)?;
-        text.parse().map_err(serde::de::Error::custom)
-    }
-}
-
-/// The text is not `sha256:` and 64 lower-case hexadecimal digits.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("expected sha256: and 64 lower-case hexadecimal digits")]
-pub struct InvalidBlobId;
 
 /// Why the store did not do what was asked. The cause is for the log, not for clients.
 #[derive(Debug, thiserror::Error)]
@@ -109,20 +49,56 @@ impl From<object_store::Error> for BlobError {
 /// A store of blobs; clones share it.
 #[derive(Clone, Debug)]
 pub struct Blobs {
-    store: Arc<dyn ObjectStore>,
-    /// Equal outputs of two jobs are one blob: nothing may be removed between the moment that a job's output was found to
-    /// be there already and the moment that the job's record names it.
+    place: Place,
+    /// Equal outputs of two jobs are one blob: on one node nothing may be removed between the moment that a job's output was found
+    /// to be there already and the moment that the job's record names it. Between nodes [`Blobs::GRACE`] does the same.
     promises: Arc<RwLock<()>>,
 }
 
 impl Blobs {
+    /// How long a blob is kept after it was put or touched, for a record to come to name it.
+    pub const GRACE: Duration = Duration::from_secs(60 * 60);
+    /// Age at which a blob that is put again, or named by a new job, is made young again: long before it may be removed.
+    const AGED: Duration = Duration::from_secs(20 * 60);
+
     /// Blobs in a folder, which is made when it is not there. Every write is synced to the disk.
-    pub fn in_folder(folder: &std::path::Path) -> Result<Self, BlobError> {
-        std::fs::create_dir_all(folder).map_err(|source| {
-            BlobError::Store(object_store::Error::Generic { store: "LocalFileSystem", source: source.into() })
-        })?;
-        let store = Arc::new(LocalFileSystem::new_with_prefix(folder)?.with_fsync(true));
-        Ok(Self { store, promises: Arc::default() })
+    ///
+    /// # Errors
+    /// When the folder cannot be made.
+    pub fn in_folder(folder: &std::path::Path) -> Result<Self, PlaceError> {
+        Ok(Self { place: Place::folder(folder)?, promises: Arc::default() })
+    }
+
+    /// Blobs in the bucket of `s3://BUCKET/PREFIX`; the rest is what the `AWS_*` variables of the environment say.
+    ///
+    /// # Errors
+    /// When the address or a variable is wrong. The bucket is not looked at: [`Blobs::probe`] does that.
+    pub fn in_bucket(url: &str) -> Result<Self, PlaceError> {
+        Ok(Self { place: Place::bucket(url)?, promises: Arc::default() })
+    }
+
+    /// Whether every node that is given this store's address sees the same blobs.
+    pub fn are_shared(&self) -> bool {
+        self.place.is_shared()
+    }
+
+    /// Writes something twice, and tells whether the store refused the second time, as it must for two nodes not to write over each
+    /// other.
+    ///
+    /// # Errors
+    /// When the store cannot be written to.
+    pub async fn probe(&self) -> Result<bool, BlobError> {
+        let path = Path::from_iter(["probes".to_owned(), uuid::Uuid::now_v7().to_string()]);
+        let (first, second) =
+            (self.create(&path, Bytes::from_static(b"1")).await?, self.create(&path, Bytes::from_static(b"2")).await);
+        self.delete(&path).await?;
+        Ok(first && matches!(second, Ok(false)))
+    }
+
+    /// An address at which a client can read a blob for so long without asking this service; `None` where the store has no such
+    /// thing.
+    pub async fn signed_link(&self, id: BlobId, valid: Duration) -> Result<Option<String>, BlobError> {
+        Ok(self.place.signed_link(&blob_path(id), valid).await?)
     }
 
     /// While this guard lives no blob is removed. Held from before a blob is put until a record names it.
@@ -137,13 +113,65 @@ impl Blobs {
     /// Stores bytes under their hash. Storing the same bytes again changes nothing.
     pub async fn put(&self, bytes: Bytes) -> Result<BlobId, BlobError> {
         let (id, bytes) = tokio::task::spawn_blocking(move || (BlobId::of(&bytes), bytes)).await.map_err(joined)?;
-        self.create(&blob_path(id), bytes).await?;
+        if !self.create(&blob_path(id), bytes.clone()).await? {
+            self.make_young(&blob_path(id), bytes).await?;
+        }
         Ok(id)
+    }
+
+    /// Makes an input that is about to be named young again, should it have come into years. `false` when it is not there.
+    pub async fn touch(&self, id: BlobId) -> Result<bool, BlobError> {
+        for path in [blob_path(id), note_path(id)] {
+            let meta = match self.store().head(&path).await {
+                Ok(meta) => meta,
+                Err(object_store::Error::NotFound { .. }) => return Ok(false),
+                Err(error) => return Err(error.into()),
+            };
+            if is_older(&meta, Self::AGED) {
+                let bytes = self.store().get(&path).await?.bytes().await?;
+                self.store().put(&path, bytes.into()).await?;
+            }
+        }
+        Ok(true)
+    }
+
+    /// Blobs that were neither put nor touched for so long, at least [`Blobs::GRACE`].
+    pub fn older_than(&self, age: Duration) -> BoxStream<'static, Result<BlobId, BlobError>> {
+        let age = age.max(Self::GRACE);
+        let all = self.store().list(Some(&Path::from(BLOBS)));
+        let old = all.try_filter_map(move |meta| {
+            let id = is_older(&meta, age).then(|| blob_of(&meta.location)).flatten();
+            std::future::ready(Ok(id))
+        });
+        old.map_err(BlobError::from).boxed()
+    }
+
+    /// Removes a blob and what describes it as an input, unless it was made young since it was listed. Tells whether it did.
+    pub async fn remove_older(&self, id: BlobId, age: Duration) -> Result<bool, BlobError> {
+        match self.store().head(&blob_path(id)).await {
+            Ok(meta) if is_older(&meta, age.max(Self::GRACE)) => {}
+            Ok(_) | Err(object_store::Error::NotFound { .. }) => return Ok(false),
+            Err(error) => return Err(error.into()),
+        }
+        // the note goes first: an input that is known is complete
+        self.delete(&note_path(id)).await?;
+        self.delete(&blob_path(id)).await?;
+        Ok(true)
+    }
+
+    /// The jobs whose checkpoints were not written for so long, by name.
+    pub fn checkpoints_older_than(&self, age: Duration) -> BoxStream<'static, Result<String, BlobError>> {
+        let all = self.store().list(Some(&Path::from(CHECKPOINTS)));
+        let old = all.try_filter_map(move |meta| {
+            let name = meta.location.filename().map(str::to_owned);
+            std::future::ready(Ok(name.filter(|_| is_older(&meta, age))))
+        });
+        old.map_err(BlobError::from).boxed()
     }
 
     /// The whole blob, its hash checked.
     pub async fn get(&self, id: BlobId) -> Result<Bytes, BlobError> {
-        let bytes = self.store.get(&blob_path(id)).await?.bytes().await?;
+        let bytes = self.store().get(&blob_path(id)).await?.bytes().await?;
         let (found, bytes) = tokio::task::spawn_blocking(move || (BlobId::of(&bytes), bytes)).await.map_err(joined)?;
         if found == id { Ok(bytes) } else { Err(BlobError::Damaged(id)) }
     }
@@ -155,7 +183,7 @@ impl Blobs {
         range: Option<Range<u64>>,
     ) -> Result<BoxStream<'static, Result<Bytes, BlobError>>, BlobError> {
         let options = GetOptions { range: range.map(GetRange::Bounded), ..GetOptions::default() };
-        let result = self.store.get_opts(&blob_path(id), options).await?;
+        let result = self.store().get_opts(&blob_path(id), options).await?;
         Ok(result.into_stream().map_err(BlobError::from).boxed())
     }
 
@@ -166,30 +194,31 @@ impl Blobs {
 
     /// The note that describes an input; `None` when there is no such input.
     pub async fn note(&self, id: BlobId) -> Result<Option<Bytes>, BlobError> {
-        match self.store.get(&note_path(id)).await {
+        match self.store().get(&note_path(id)).await {
             Ok(found) => Ok(Some(found.bytes().await?)),
             Err(object_store::Error::NotFound { .. }) => Ok(None),
             Err(error) => Err(error.into()),
         }
     }
 
-    /// Removes a blob; one that is not there is no error.
+    /// Removes a blob; one that is not there is no error. Where other nodes may be about to name it, nothing happens: what is named by
+    /// nobody is removed when it is old.
     pub async fn remove(&self, id: BlobId) -> Result<(), BlobError> {
-        match self.store.delete(&blob_path(id)).await {
-            Ok(()) | Err(object_store::Error::NotFound { .. }) => Ok(()),
-            Err(error) => Err(error.into()),
+        if self.are_shared() {
+            return Ok(());
         }
+        self.delete(&blob_path(id)).await
     }
 
     /// Writes the checkpoint of a job over the one before. Whoever writes it, it is the state of the same computation.
     pub async fn put_checkpoint(&self, job: &str, bytes: Bytes) -> Result<(), BlobError> {
-        self.store.put(&checkpoint_path(job), bytes.into()).await?;
+        self.store().put(&checkpoint_path(job), bytes.into()).await?;
         Ok(())
     }
 
     /// The checkpoint of a job, if it has one.
     pub async fn checkpoint(&self, job: &str) -> Result<Option<Bytes>, BlobError> {
-        match self.store.get(&checkpoint_path(job)).await {
+        match self.store().get(&checkpoint_path(job)).await {
             Ok(found) => Ok(Some(found.bytes().await?)),
             Err(object_store::Error::NotFound { .. }) => Ok(None),
             Err(error) => Err(error.into()),
@@ -198,21 +227,40 @@ impl Blobs {
 
     /// Removes the checkpoint of a job; one that is not there is no error.
     pub async fn remove_checkpoint(&self, job: &str) -> Result<(), BlobError> {
-        match self.store.delete(&checkpoint_path(job)).await {
+        self.delete(&checkpoint_path(job)).await
+    }
+
+    /// Whether the store answers.
+    pub async fn health(&self) -> Result<(), BlobError> {
+        self.store().list_with_delimiter(None).await?;
+        Ok(())
+    }
+
+    fn store(&self) -> &Arc<dyn ObjectStore> {
+        self.place.store()
+    }
+
+    async fn delete(&self, path: &Path) -> Result<(), BlobError> {
+        match self.store().delete(path).await {
             Ok(()) | Err(object_store::Error::NotFound { .. }) => Ok(()),
             Err(error) => Err(error.into()),
         }
     }
 
-    /// Whether the store answers.
-    pub async fn health(&self) -> Result<(), BlobError> {
-        self.store.list_with_delimiter(None).await?;
+    /// Writes what is there already once more, if it is aged or has gone meanwhile.
+    async fn make_young(&self, path: &Path, bytes: Bytes) -> Result<(), BlobError> {
+        match self.store().head(path).await {
+            Ok(meta) if !is_older(&meta, Self::AGED) => return Ok(()),
+            Ok(_) | Err(object_store::Error::NotFound { .. }) => {}
+            Err(error) => return Err(error.into()),
+        }
+        self.store().put(path, bytes.into()).await?;
         Ok(())
     }
 
     async fn create(&self, path: &Path, bytes: Bytes) -> Result<bool, BlobError> {
         let options = PutOptions { mode: PutMode::Create, ..PutOptions::default() };
-        match self.store.put_opts(path, bytes.into(), options).await {
+        match self.store().put_opts(path, bytes.into(), options).await {
             Ok(_) => Ok(true),
             Err(object_store::Error::AlreadyExists { .. }) => Ok(false),
             Err(error) => Err(error.into()),
@@ -220,13 +268,29 @@ impl Blobs {
     }
 }
 
+/// Folders of the store.
+const BLOBS: &str = "sha256";
+const CHECKPOINTS: &str = "checkpoints";
+
 fn checkpoint_path(job: &str) -> Path {
-    Path::from_iter(["checkpoints", job])
+    Path::from_iter([CHECKPOINTS, job])
 }
 
 fn blob_path(id: BlobId) -> Path {
     let hex = id.hex();
-    Path::from_iter(["sha256", &hex[..2], &hex[2..]])
+    Path::from_iter([BLOBS, &hex[..2], &hex[2..]])
+}
+
+/// The blob that lies at a path.
+fn blob_of(path: &Path) -> Option<BlobId> {
+    let digits: Vec<_> = path.parts().skip(1).collect();
+    BlobId::from_hex(&digits.iter().map(AsRef::as_ref).collect::<String>())
+}
+
+/// Whether something was last written so long ago, by this node's clock and the store's.
+fn is_older(meta: &ObjectMeta, age: Duration) -> bool {
+    let written = meta.last_modified.timestamp_millis();
+    Timestamp::now().as_millisecond().saturating_sub(written) > age.as_millis() as i64
 }
 
 fn note_path(id: BlobId) -> Path {
@@ -264,14 +328,5 @@ mod tests {
         blobs.put(Bytes::from_static(b"x")).await.expect("put");
         std::fs::write(folder.path().join(blob_path(id).as_ref()), "y").expect("edit");
         assert!(matches!(blobs.get(id).await, Err(BlobError::Damaged(_))));
-    }
-
-    #[test]
-    fn names_that_are_no_hash_are_refused() {
-        for name in
-            ["sha256:ab", "md5:00", &format!("sha256:{}", "AB".repeat(32)), &format!("sha256:{}", "é".repeat(32))]
-        {
-            assert_eq!(name.parse::<BlobId>(), Err(InvalidBlobId), "{name}");
-        }
     }
 }

@@ -15,6 +15,7 @@ mod options;
 pub mod sensitivity;
 pub mod serve;
 
+use crate::config::Role;
 use crate::field::Domain;
 use crate::field::input::{DomainName, DomainOption, FieldOptions};
 use crate::measure::chart::SphereChart;
@@ -83,6 +84,12 @@ pub struct ServeArgs {
     /// Folder of the database and the blobs [default: ./shrinkd-data]
     #[arg(long, value_name = "DIR")]
     pub data: Option<PathBuf>,
+    /// Where inputs and outputs lie: folder, or s3://BUCKET/PREFIX [default: folder]
+    #[arg(long, value_name = "URL")]
+    pub blobs: Option<String>,
+    /// What this node does [default: all]
+    #[arg(long, value_enum)]
+    pub role: Option<Role>,
     /// Configuration file (TOML)
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,

@@ -5,6 +5,7 @@
 
 use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
+use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -19,12 +20,55 @@ pub struct Config {
     pub data_dir: PathBuf,
     /// Origins whose pages may call the service (`SHRINKD_CORS_ORIGINS`, a list); none.
     pub cors_origins: Vec<String>,
+    /// Where inputs and outputs lie (`SHRINKD_BLOBS`): `folder`, in the folder above; or `s3://BUCKET/PREFIX`, with what the `AWS_*`
+    /// variables say (`AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`, `AWS_REGION`, `AWS_ENDPOINT`, `AWS_ALLOW_HTTP`).
+    pub blobs: String,
+    /// Seconds for which a download is answered with a link into the bucket (`SHRINKD_DOWNLOAD_LINK_S`): 0 sends the bytes.
+    pub download_link_s: u64,
+    /// What this node does (`SHRINKD_ROLE`).
+    pub role: Role,
     /// Sizes of requests.
     pub limits: Limits,
+    /// What is kept, and for how long.
+    pub retention: Retention,
     /// The worker.
     pub worker: WorkerConfig,
     /// The log.
     pub log: LogConfig,
+}
+
+/// What a node does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Role {
+    /// Answers requests and runs jobs.
+    All,
+    /// Answers requests only.
+    Api,
+    /// Runs jobs only; answers nothing but whether it lives and is ready.
+    Worker,
+}
+
+/// What is kept, and for how long.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Retention {
+    /// Seconds that outputs and inputs of a job are kept after its end (`SHRINKD_RETENTION__OUTPUTS_S`): 0 keeps them as long
+    /// as the job is remembered.
+    pub outputs_s: u64,
+    /// Seconds that an input is kept which no job names (`SHRINKD_RETENTION__INPUTS_S`), after it was last uploaded; at least an
+    /// hour.
+    pub inputs_s: u64,
+    /// Seconds between two looks at what can go (`SHRINKD_RETENTION__EVERY_S`).
+    pub every_s: u64,
+}
+
+impl Retention {
+    /// The time before which a job must have ended for its outputs to have expired at `now`; `None` when they never do.
+    pub fn expired(&self, now: Timestamp) -> Option<Timestamp> {
+        let kept = i64::try_from(self.outputs_s).ok().filter(|&s| s > 0)?;
+        now.checked_sub(jiff::SignedDuration::from_secs(kept)).ok()
+    }
 }
 
 /// Sizes of requests.
@@ -77,6 +121,10 @@ impl Default for Config {
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
             data_dir: PathBuf::from("./shrinkd-data"),
             cors_origins: Vec::new(),
+            blobs: FOLDER.to_owned(),
+            download_link_s: 0,
+            role: Role::All,
+            retention: Retention { outputs_s: 0, inputs_s: 7 * 24 * 3600, every_s: 3600 },
             limits: Limits { body_bytes: 1 << 20, input_bytes: 256 << 20 },
             worker: WorkerConfig { slots: 2, threads: 0, lease_s: 30, max_losses: 5 },
             log: LogConfig { format: LogFormat::Pretty, filter: "info".to_owned() },
@@ -84,8 +132,12 @@ impl Default for Config {
     }
 }
 
-/// Variables of the project that are no settings of the service: test data, and the renewal of stored metrics.
-const NOT_SETTINGS: [&str; 2] = ["DATA", "RENEW_METRICS"];
+/// Blobs in the node's own folder.
+pub const FOLDER: &str = "folder";
+
+/// Variables of the project that are no settings of the service: test data, the renewal of stored metrics, and servers
+/// that tests start.
+const NOT_SETTINGS: [&str; 4] = ["DATA", "RENEW_METRICS", "NATS_SERVER", "MOTO_SERVER"];
 
 impl Config {
     /// Reads the configuration; `flags` are what the command line says.
@@ -104,6 +156,8 @@ impl Config {
             (config.worker.slots == 0, "worker.slots must be at least 1"),
             (config.worker.lease_s == 0, "worker.lease_s must be at least 1"),
             (config.worker.max_losses == 0, "worker.max_losses must be at least 1"),
+            (config.retention.every_s == 0, "retention.every_s must be at least 1"),
+            (config.retention.inputs_s < 3600, "retention.inputs_s must be at least 3600"),
             (config.limits.body_bytes == 0 || config.limits.input_bytes == 0, "limits must be at least 1"),
         ];
         match wrong.iter().find(|(is_wrong, _)| *is_wrong) {

@@ -193,6 +193,10 @@ pub trait Engine: Send + Sync {
     /// Forgets an ended job.
     async fn forget(&self, id: JobId) -> Result<Forgotten, EngineError>;
 
+    /// Those of these blobs (hexadecimal SHA-256) that no job names: neither as an input nor as an output. Jobs that ended before
+    /// `expired` do not count, where it is given. When in doubt a blob counts as named.
+    async fn unnamed(&self, blobs: Vec<String>, expired: Option<Timestamp>) -> Result<Vec<String>, EngineError>;
+
     /// Takes up to `slots` jobs, oldest first, waiting at most `wait` for the first.
     async fn claim(&self, worker: &str, slots: usize, wait: Duration) -> Result<Vec<Claim>, EngineError>;
     /// Extends a claim and tells its news.

@@ -21,11 +21,12 @@ pub mod query;
 pub use problem::Problem;
 
 use crate::blobs::Blobs;
-use crate::config::Limits;
+use crate::config::{Limits, Retention};
 use crate::engine::Engine;
 use axum::http::HeaderValue;
 use axum::middleware;
 use std::sync::Arc;
+use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 use tower_http::catch_panic::CatchPanicLayer;
 use tower_http::cors::CorsLayer;
@@ -41,6 +42,10 @@ pub struct App {
     pub blobs: Blobs,
     /// Sizes that requests may have.
     pub limits: Limits,
+    /// How long outputs are kept.
+    pub retention: Retention,
+    /// How long a link into the bucket is good for that a download is answered with; zero sends the bytes.
+    pub download_link: Duration,
     /// Raised when the service stops.
     pub stop: CancellationToken,
 }
@@ -69,6 +74,16 @@ fn api() -> OpenApiRouter<App> {
 /// The description of the service, as it is pinned in `openapi.yaml`.
 pub fn document() -> utoipa::openapi::OpenApi {
     openapi::complete(api().into_openapi())
+}
+
+/// What a node that only runs jobs answers: whether it lives and is ready.
+pub fn health_router(app: App) -> axum::Router {
+    let (router, _) = OpenApiRouter::<App>::default()
+        .routes(routes!(health::livez))
+        .routes(routes!(health::readyz))
+        .split_for_parts();
+    let router = router.fallback(problem::unknown_route).method_not_allowed_fallback(problem::wrong_method);
+    router.with_state(app).layer(middleware::from_fn(context::request))
 }
 
 /// The service. Browsers of other origins are let in only when `cors_origins` names them.

@@ -4,6 +4,7 @@
 //! Guarantees: a request that was accepted can be read back and run by any later process; a record's `revision` grows with
 //! every change. This room may read the clock; the numeric rooms below it may not.
 
+pub mod collector;
 pub mod event;
 pub mod failure;
 pub mod pipeline;

@@ -2,10 +2,11 @@
 
 use super::{BAD_USAGE, FAILED, ServeArgs, fail, first_job};
 use crate::blobs::Blobs;
-use crate::config::Config;
+use crate::config::{Config, FOLDER, Role};
 use crate::engine::Engine;
 use crate::engine::sqlite::{SqliteEngine, Terms};
 use crate::http::{self, App};
+use crate::job::collector;
 use crate::job::worker::Worker;
 use crate::telemetry;
 use serde::Serialize;
@@ -27,11 +28,16 @@ struct Flags<'a> {
     listen: Option<std::net::SocketAddr>,
     #[serde(skip_serializing_if = "Option::is_none")]
     data_dir: Option<&'a std::path::Path>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    blobs: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    role: Option<Role>,
 }
 
 /// Runs the service until SIGTERM or SIGINT.
 pub fn run(args: &ServeArgs) -> ExitCode {
-    let flags = Flags { listen: args.listen, data_dir: args.data.as_deref() };
+    let flags =
+        Flags { listen: args.listen, data_dir: args.data.as_deref(), blobs: args.blobs.as_deref(), role: args.role };
     let config = match Config::load(args.config.as_deref(), flags) {
         Ok(config) => config,
         Err(error) => return fail(BAD_USAGE, &error),
@@ -52,10 +58,30 @@ pub fn run(args: &ServeArgs) -> ExitCode {
     }
 }
 
+/// Opens the blob store, and warns of what will not work with it.
+async fn open_blobs(config: &Config) -> Result<Blobs, Box<dyn std::error::Error>> {
+    if config.blobs == FOLDER {
+        if config.download_link_s > 0 {
+            tracing::warn!("download_link_s does nothing: blobs in a folder have no links");
+        }
+        return Ok(Blobs::in_folder(&config.data_dir.join("blobs"))?);
+    }
+    let blobs = Blobs::in_bucket(&config.blobs)?;
+    match blobs.probe().await {
+        Ok(true) => {}
+        Ok(false) => tracing::warn!(
+            "the bucket has no conditional put: two nodes may write over each other what describes an input"
+        ),
+        // it may come up later; until then the service is not ready
+        Err(error) => tracing::warn!(%error, "the bucket cannot be written to"),
+    }
+    Ok(blobs)
+}
+
 async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std::error::Error>> {
     let terms = Terms { lease: Duration::from_secs(config.worker.lease_s), max_losses: config.worker.max_losses };
     let engine: Arc<dyn Engine> = Arc::new(SqliteEngine::open(&config.data_dir, terms)?);
-    let blobs = Blobs::in_folder(&config.data_dir.join("blobs"))?;
+    let blobs = open_blobs(&config).await?;
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(config.worker.threads)
         .thread_name(|i| format!("pool-{i}"))
@@ -68,16 +94,28 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
     if !address.ip().is_loopback() {
         tracing::warn!("listening beyond loopback without authentication: whoever reaches this address can use it");
     }
-    let worker = Worker {
-        engine: engine.clone(),
-        blobs: blobs.clone(),
+    let (engine_of_worker, blobs_of_worker) = (engine.clone(), blobs.clone());
+    let worker = move || Worker {
+        engine: engine_of_worker,
+        blobs: blobs_of_worker,
         pool: Arc::new(pool),
         slots: config.worker.slots,
         name: format!("worker-{}", uuid::Uuid::now_v7()),
     };
-    let worker = tokio::spawn(worker.run(stop.clone()));
-    let app = App { engine, blobs, limits: config.limits.clone(), stop: stop.clone() };
-    let router = http::router(app, &config.cors_origins);
+    let worker = (config.role != Role::Api).then(|| tokio::spawn(worker().run(stop.clone())));
+    tokio::spawn(collector::run(engine.clone(), blobs.clone(), config.retention, stop.clone()));
+    let app = App {
+        engine,
+        blobs,
+        limits: config.limits.clone(),
+        retention: config.retention,
+        download_link: Duration::from_secs(config.download_link_s),
+        stop: stop.clone(),
+    };
+    let router = match config.role {
+        Role::Worker => http::health_router(app),
+        Role::All | Role::Api => http::router(app, &config.cors_origins),
+    };
     let routes = router.clone();
     let graceful = axum::serve(listener, router).with_graceful_shutdown(stop.clone().cancelled_owned());
     let server = tokio::spawn(graceful.into_future());
@@ -93,9 +131,10 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
     }
     stop.cancel();
     let drained = async {
-        let (server, worker) = tokio::join!(server, worker);
-        server??;
-        worker?;
+        if let Some(worker) = worker {
+            worker.await?;
+        }
+        server.await??;
         Ok::<_, Box<dyn std::error::Error>>(())
     };
     match tokio::time::timeout(DRAIN, drained).await {

@@ -15,6 +15,7 @@ use crate::blobs::BlobId;
 use crate::job::spec::{WarmStartSpec, Work};
 use crate::job::{Event, EventKind, Failure, JobId, JobSpec, Output, ProgressView, State};
 use futures::StreamExt;
+use jiff::Timestamp;
 use serde_json::json;
 use std::sync::Arc;
 use std::time::Duration;
@@ -55,6 +56,7 @@ pub async fn run(engine: Arc<dyn Engine>) {
     lists_are_newest_first_paged_and_filtered(&engine).await;
     only_an_ended_job_is_forgotten(&engine).await;
     a_surface_is_kept_for_the_jobs_that_begin_from_it(&engine).await;
+    a_blob_is_named_while_a_job_remembers_it(&engine).await;
     engine.health().await.expect("healthy");
 }
 
@@ -244,6 +246,29 @@ async fn a_job_that_is_lost_too_often_fails(engine: &Arc<dyn Engine>) {
     let job = engine.get(id).await.expect("reads").expect("is there");
     assert_eq!(job.state, State::Failed);
     assert_eq!(job.problem.map(|p| p.code).as_deref(), Some("attempts_exhausted"));
+}
+
+async fn a_blob_is_named_while_a_job_remembers_it(engine: &Arc<dyn Engine>) {
+    let (input, output, stray) =
+        (BlobId::of(b"an input"), BlobId::of(b"an output").hex(), BlobId::of(b"a stray").hex());
+    let request = json!({"field": {"input": input.to_string()}});
+    let spec =
+        JobSpec::from_value(&request).unwrap_or_else(|faults| panic!("the suite's own job is refused: {faults:?}"));
+    let id = submit(engine, NewJob { id: JobId::new(), spec, key: None }).await;
+    let unnamed = async |expired: Option<Timestamp>| {
+        let blobs = vec![input.hex(), output.clone(), stray.clone()];
+        engine.unnamed(blobs, expired).await.expect("answers")
+    };
+    assert_eq!(unnamed(None).await, [output.clone(), stray.clone()]);
+    let claim = claim_one(engine, "a").await;
+    engine.finish(&claim, success(&output)).await.expect("finishes");
+    let ended = engine.get(id).await.expect("reads").expect("is there").finished_at.expect("has ended");
+    assert_eq!(unnamed(None).await, [stray.clone()]);
+    assert_eq!(unnamed(Some(ended)).await, [stray.clone()], "it ended then, and not before");
+    let later = ended.checked_add(jiff::SignedDuration::from_secs(1)).expect("a time");
+    assert_eq!(unnamed(Some(later)).await, [input.hex(), output.clone(), stray.clone()]);
+    assert_eq!(engine.forget(id).await.expect("answers"), Forgotten::Gone(vec![output.clone()]), "inputs stay");
+    assert_eq!(unnamed(None).await, [input.hex(), output.clone(), stray.clone()]);
 }
 
 async fn collect(engine: &Arc<dyn Engine>, id: JobId, after: Option<u64>) -> Vec<Event> {

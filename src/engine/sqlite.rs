@@ -13,6 +13,7 @@ use super::{
     Renewal, Submitted, Update,
 };
 use crate::job::{Failure, Job, JobId, JobSpec, State};
+use jiff::Timestamp;
 use records::{Change, Ctx};
 use rusqlite::{Connection, OptionalExtension, params};
 use std::fs::{File, TryLockError};
@@ -189,6 +190,10 @@ impl Engine for SqliteEngine {
             Ok(Forgotten::Gone(unused))
         })
         .await
+    }
+
+    async fn unnamed(&self, blobs: Vec<String>, expired: Option<Timestamp>) -> Result<Vec<String>, EngineError> {
+        self.read(move |c| records::unnamed(c, blobs, expired)).await
     }
 
     async fn claim(&self, worker: &str, slots: usize, wait: Duration) -> Result<Vec<Claim>, EngineError> {

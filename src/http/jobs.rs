@@ -89,34 +89,27 @@ pub async fn submit(
         let fault = Fault { pointer: "/kind".to_owned(), code: "not_offered", detail };
         return Err(Problem::invalid_request("", &[fault]));
     }
+    let key = key.map(|key| IdempotencyKey { key, fingerprint });
+    // a repeated request has its answer, also when what it named is gone by now
+    if let Some(key) = key.as_ref().filter(|_| !validate_only)
+        && let Some(answer) = app.engine.recall(key.clone()).await?
+    {
+        return answer_submit(&app, &headers, answer).await;
+    }
+    // no blob goes from the moment that it is looked up until the new job's record names it
+    let promise = app.blobs.promise().await;
     let dimension = check_fields(&app, &spec).await?;
     let mut spec = spec.for_dimension(dimension, &request).map_err(|faults| Problem::invalid_request("", &faults))?;
-    let key = key.map(|key| IdempotencyKey { key, fingerprint });
-    // a repeated request has its answer, also when the job that it began from is forgotten by now
-    let warm = matches!(&spec.work, Work::Shrink(work) if work.warm_start.is_some());
-    let recalled = match &key {
-        Some(key) if warm && !validate_only => app.engine.recall(key.clone()).await?,
-        _ => None,
-    };
-    // no blob goes from the moment that it is looked up until the new job's record names it
-    let promise = match (warm, &recalled) {
-        (true, None) => {
-            let promise = app.blobs.promise().await;
-            warm_start::resolve(&app, &mut spec).await?;
-            Some(promise)
-        }
-        _ => None,
-    };
+    if matches!(&spec.work, Work::Shrink(work) if work.warm_start.is_some()) {
+        warm_start::resolve(&app, &mut spec).await?;
+    }
     if validate_only {
         return Ok(Json(estimate(&spec, dimension)).into_response());
     }
     if app.stop.is_cancelled() {
         return Err(Problem::unavailable("stopping", "the service is stopping"));
     }
-    let submitted = match recalled {
-        Some(answer) => answer,
-        None => app.engine.submit(NewJob { id: JobId::new(), spec, key }).await?,
-    };
+    let submitted = app.engine.submit(NewJob { id: JobId::new(), spec, key }).await?;
     drop(promise);
     answer_submit(&app, &headers, submitted).await
 }
@@ -350,9 +343,10 @@ fn surface_blob(job: &Job) -> Option<BlobId> {
     output.and_then(|output| BlobId::from_hex(&output.sha256))
 }
 
-/// What an input holds that is named at `pointer`.
+/// What an input holds that is about to be named at `pointer`.
 async fn described(app: &App, id: BlobId, pointer: &str) -> Result<Input, Problem> {
-    let Some(note) = app.blobs.note(id).await? else {
+    let note = if app.blobs.touch(id).await? { app.blobs.note(id).await? } else { None };
+    let Some(note) = note else {
         let detail = format!("no input {id} is stored; upload it to /v1/inputs first");
         let fault = Fault { pointer: pointer.to_owned(), code: "unknown_input", detail };
         return Err(Problem::invalid_request("", &[fault]));

@@ -11,6 +11,7 @@ use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, header}
 use axum::response::{IntoResponse, Response};
 use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD;
+use jiff::Timestamp;
 
 /// What a job made never changes, and may be forgotten: a day in a private cache.
 const CACHE: &str = "private, max-age=86400, immutable";
@@ -36,6 +37,8 @@ const CACHE: &str = "private, max-age=86400, immutable";
                 (String = "image/svg+xml"), (crate::measure::AnyReport = "application/json"))),
         (status = 206, description = "the range of it", headers(("Content-Range", description = "which bytes"))),
         (status = 304, description = "it is there already"),
+        (status = 307, description = "it is at the address in `Location` for a while, where the service is told to say so", headers(
+            ("Location", description = "a link into the bucket that needs no credentials"))),
         (status = 400, description = "a query parameter is unknown"),
         (status = 404, description = "there is no such job, or it has no such output"),
         (status = 409, description = "the job has not ended"),
@@ -63,6 +66,13 @@ pub async fn download(
         return Err(Problem::conflict("job_not_ended", "the job has not ended", detail).retry_after(1));
     }
     let output = job.outputs.iter().find(|o| o.name == name).ok_or_else(unknown)?;
+    let expired = || {
+        let detail = "the job is remembered, its bytes are not";
+        Problem::new(StatusCode::GONE, "output_expired", "the output is no longer kept", detail)
+    };
+    if app.retention.expired(Timestamp::now()).is_some_and(|before| job.finished_at < Some(before)) {
+        return Err(expired());
+    }
     let blob = BlobId::from_hex(&output.sha256).ok_or_else(Problem::internal)?;
     let tag = format!("\"{}\"", output.sha256);
     let digest = format!("sha-256=:{}:", BASE64_STANDARD.encode(blob.bytes()));
@@ -83,6 +93,13 @@ pub async fn download(
     set(header::CONTENT_DISPOSITION, &format!("inline; filename=\"{id}.{}\"", kind.extension()))?;
     // a browser must not guess that an output is a page
     set(header::X_CONTENT_TYPE_OPTIONS, "nosniff")?;
+    if !app.download_link.is_zero()
+        && let Some(link) = app.blobs.signed_link(blob, app.download_link).await?
+    {
+        // the link dies before its answer may be reused
+        let answer = [(header::LOCATION, link), (header::CACHE_CONTROL, "no-store".to_owned())];
+        return Ok((StatusCode::TEMPORARY_REDIRECT, answer).into_response());
+    }
     let (status, range) = match conditional::part(&headers, &tag, output.bytes) {
         Part::Whole => (StatusCode::OK, None),
         Part::Bytes(range) => {
@@ -101,10 +118,7 @@ pub async fn download(
     set(header::CONTENT_LENGTH, &length.to_string())?;
     let bytes = match app.blobs.stream(blob, range).await {
         Ok(bytes) => bytes,
-        Err(BlobError::Missing) => {
-            let detail = "the job is remembered, its bytes are not";
-            return Err(Problem::new(StatusCode::GONE, "output_expired", "the output is no longer kept", detail));
-        }
+        Err(BlobError::Missing) => return Err(expired()),
         Err(error) => return Err(error.into()),
     };
     let body = if method == Method::HEAD { Body::empty() } else { Body::from_stream(bytes) };

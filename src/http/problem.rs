@@ -209,7 +209,8 @@ impl From<EngineError> for Problem {
         tracing::error!(%error, "the engine failed");
         match error {
             EngineError::Stopped => Self::unavailable("stopping", "the service is stopping"),
-            EngineError::Store(_) | EngineError::Fenced { .. } => Self::internal(),
+            EngineError::Store(_) => Self::unavailable("engine_unavailable", "the queue is out of reach"),
+            EngineError::Fenced { .. } => Self::internal(),
         }
     }
 }
@@ -217,7 +218,10 @@ impl From<EngineError> for Problem {
 impl From<BlobError> for Problem {
     fn from(error: BlobError) -> Self {
         tracing::error!(%error, "the blob store failed");
-        Self::internal()
+        match error {
+            BlobError::Store(_) => Self::unavailable("blobs_unavailable", "the blob store is out of reach"),
+            BlobError::Missing | BlobError::Damaged(_) => Self::internal(),
+        }
     }
 }
 

@@ -16,6 +16,7 @@ use std::cell::Cell;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
+use tokio::time::Interval;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 use tracing::Instrument as _;
@@ -34,6 +35,20 @@ const BACKOFF: Duration = Duration::from_secs(1);
 const FINISH_TRIES: u32 = 5;
 /// Time that running jobs get to come to their end once the service stops.
 pub const GRACE: Duration = Duration::from_secs(2);
+
+/// Why an attempt made nothing.
+enum Unfinished {
+    /// The job has come to its end.
+    Ended(Ended),
+    /// What it needs is out of reach: another attempt may do better.
+    OutOfReach,
+}
+
+impl From<Failure> for Unfinished {
+    fn from(failure: Failure) -> Self {
+        Self::Ended(failure.into())
+    }
+}
 
 /// What a worker works with.
 pub struct Worker {
@@ -149,10 +164,15 @@ impl Worker {
         // nothing that a record names may be removed from here until the record names it
         let promise = self.blobs.promise().await;
         let outcome = match result {
-            Ok(made) => self.store(&claim, made).await,
-            Err(Ended::Failed(failure)) => Outcome::failed(*failure),
-            Err(Ended::Canceled) if returning => Outcome::Released,
-            Err(Ended::Canceled) => Outcome::Canceled,
+            Ok(made) => self.renewing(&claim, &mut heartbeat, self.store(&claim, made)).await,
+            Err(Unfinished::Ended(Ended::Failed(failure))) => Some(Outcome::failed(*failure)),
+            Err(Unfinished::Ended(Ended::Canceled)) if returning => Some(Outcome::Released),
+            Err(Unfinished::Ended(Ended::Canceled)) => Some(Outcome::Canceled),
+            Err(Unfinished::OutOfReach) => None,
+        };
+        let Some(outcome) = outcome else {
+            tracing::warn!("the blob store is out of reach; the job is left to the next attempt");
+            return;
         };
         let over = !matches!(outcome, Outcome::Released);
         self.end(&claim, outcome).await;
@@ -163,6 +183,18 @@ impl Worker {
             tracing::warn!(%error, "the checkpoint of an ended job could not be removed");
         }
         drop(promise);
+    }
+
+    /// Does what may take long at the end without losing the claim over it.
+    async fn renewing<T>(&self, claim: &Claim, heartbeat: &mut Interval, work: impl Future<Output = T>) -> T {
+        tokio::pin!(work);
+        loop {
+            tokio::select! {
+                done = &mut work => return done,
+                // should it be lost, the end is fenced off
+                _ = heartbeat.tick() => { self.renew(claim, Vec::new()).await; }
+            }
+        }
     }
 
     async fn renew(&self, claim: &Claim, updates: Vec<Update>) -> Renewal {
@@ -179,7 +211,7 @@ impl Worker {
         claim: Claim,
         cancel: CancelToken,
         news: mpsc::UnboundedSender<Update>,
-    ) -> impl Future<Output = Result<pipeline::Finished, Ended>> + Send + use<> {
+    ) -> impl Future<Output = Result<pipeline::Finished, Unfinished>> + Send + use<> {
         let (blobs, pool) = (self.blobs.clone(), self.pool.clone());
         async move {
             let clock = Instant::now();
@@ -196,7 +228,7 @@ impl Worker {
                 _ => None,
             };
             let (span, runtime) = (tracing::Span::current(), tokio::runtime::Handle::current());
-            let compute = move || {
+            let compute = move || -> Result<pipeline::Finished, Ended> {
                 let _entered = span.enter();
                 let teller = Teller::new(news);
                 let progress = |progress: Progress| teller.tell(progress);
@@ -245,15 +277,16 @@ impl Worker {
                     }
                 }
             };
-            tokio::task::spawn_blocking(compute).await.unwrap_or_else(|panic| {
+            let made = tokio::task::spawn_blocking(compute).await.unwrap_or_else(|panic| {
                 tracing::error!(%panic, "the computation panicked");
                 Err(Failure::internal().into())
-            })
+            });
+            made.map_err(Unfinished::Ended)
         }
     }
 
-    /// Stores the outputs; they are durable before the outcome that names them is told.
-    async fn store(&self, claim: &Claim, made: pipeline::Finished) -> Outcome {
+    /// Stores the outputs; they are durable before the outcome that names them is told. `None` when they cannot be stored.
+    async fn store(&self, claim: &Claim, made: pipeline::Finished) -> Option<Outcome> {
         let certified = made.certified;
         let mut outputs = Vec::new();
         for (name, bytes) in made.files {
@@ -269,15 +302,15 @@ impl Worker {
                 }),
                 Err(error) => {
                     tracing::error!(%error, output = name.name(), "an output could not be stored");
-                    return Outcome::failed(Failure::internal());
+                    return None;
                 }
             }
         }
         let metrics = made.metrics;
-        match made.problem {
+        Some(match made.problem {
             None => Outcome::Succeeded { outputs, metrics },
             Some(problem) => Outcome::Failed { problem, outputs, metrics: Some(metrics) },
-        }
+        })
     }
 
     async fn end(&self, claim: &Claim, outcome: Outcome) {
@@ -307,16 +340,20 @@ impl Worker {
 }
 
 /// The bytes of an input that a job names.
-async fn read_input(blobs: &Blobs, id: BlobId) -> Result<Bytes, Failure> {
+async fn read_input(blobs: &Blobs, id: BlobId) -> Result<Bytes, Unfinished> {
     match blobs.get(id).await {
         Ok(bytes) => Ok(bytes),
         Err(BlobError::Missing) => {
             let detail = format!("no input {id} is stored");
-            Err(Failure::new("unknown_input", "the input is not there", detail))
+            Err(Failure::new("unknown_input", "the input is not there", detail).into())
         }
-        Err(error) => {
+        Err(error @ BlobError::Damaged(_)) => {
             tracing::error!(%error, "the input could not be read");
-            Err(Failure::internal())
+            Err(Failure::internal().into())
+        }
+        Err(error @ BlobError::Store(_)) => {
+            tracing::error!(%error, "the input could not be read");
+            Err(Unfinished::OutOfReach)
         }
     }
 }

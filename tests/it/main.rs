@@ -1,6 +1,7 @@
 //! Tests of the whole program from outside: the real binary, over HTTP and on the command line.
 
 mod app;
+mod bucket;
 mod certify;
 mod cli;
 mod conditional;
@@ -15,6 +16,8 @@ mod metrics;
 mod reading;
 mod refusals;
 mod relaxed;
+#[path = "../support/bucket.rs"]
+mod s3;
 mod sensitivity;
 mod walk;
 mod warm;

@@ -124,6 +124,7 @@ pub(super) fn insert(ctx: &mut Ctx<'_>, new: &NewJob) -> rusqlite::Result<()> {
     for (name, blob) in spec.work.held() {
         name_blob(ctx.connection, new.id, name, &blob.hex())?;
     }
+    name_inputs(ctx.connection, new.id)?;
     for (name, value) in &spec.labels {
         let label = "INSERT INTO labels (job, name, value) VALUES (?1, ?2, ?3)";
         ctx.connection.execute(label, params![id, name, value])?;
@@ -131,15 +132,48 @@ pub(super) fn insert(ctx: &mut Ctx<'_>, new: &NewJob) -> rusqlite::Result<()> {
     tell_state(ctx, new.id)
 }
 
+/// Notes the blobs that a job's request names, whatever member of it does, so that they are kept while the job is.
+fn name_inputs(connection: &Connection, job: JobId) -> rusqlite::Result<()> {
+    let named = format!("{NAME_INPUTS} WHERE jobs.id = ?1 AND {IS_BLOB}");
+    connection.prepare_cached(&named)?.execute([job.to_string()]).map(|_| ())
+}
+
+/// Notes the inputs of jobs; to be followed by which, and by [`IS_BLOB`].
+pub(super) const NAME_INPUTS: &str = "INSERT OR IGNORE INTO outputs (job, name, sha256)
+    SELECT jobs.id, 'input:' || member.fullkey, substr(member.value, 8) FROM jobs, json_tree(jobs.spec) AS member";
+/// Whether a member of a request is the name of a blob.
+pub(super) const IS_BLOB: &str =
+    "member.type = 'text' AND length(member.value) = 71 AND substr(member.value, 1, 7) = 'sha256:'";
+
 /// Notes that a job names a blob, so that the blob is kept while the job is.
 fn name_blob(connection: &Connection, job: JobId, name: &str, sha256: &str) -> rusqlite::Result<()> {
     let named = "INSERT INTO outputs (job, name, sha256) VALUES (?1, ?2, ?3)";
     connection.execute(named, params![job.to_string(), name, sha256]).map(|_| ())
 }
 
-/// The blobs that a job names, each once.
+/// Those of these blobs that no job names; jobs that ended before `expired` do not count.
+pub(super) fn unnamed(
+    connection: &Connection,
+    mut blobs: Vec<String>,
+    expired: Option<Timestamp>,
+) -> rusqlite::Result<Vec<String>> {
+    let named = "SELECT 1 FROM outputs JOIN jobs ON jobs.id = outputs.job
+                 WHERE sha256 = ?1 AND (finished_at IS NULL OR finished_at >= ?2) LIMIT 1";
+    let (mut named, expired) = (connection.prepare_cached(named)?, expired.map_or(0, Timestamp::as_millisecond));
+    let mut kept = Vec::with_capacity(blobs.len());
+    for blob in &blobs {
+        kept.push(named.exists(params![blob, expired])?);
+    }
+    let mut kept = kept.into_iter();
+    blobs.retain(|_| kept.next() == Some(false));
+    Ok(blobs)
+}
+
+/// The blobs that a job names and that are no inputs of it, each once.
 pub(super) fn named_blobs(connection: &Connection, job: JobId) -> rusqlite::Result<Vec<String>> {
-    let mut named = connection.prepare_cached("SELECT DISTINCT sha256 FROM outputs WHERE job = ?1 ORDER BY name")?;
+    let mut named = connection.prepare_cached(
+        "SELECT DISTINCT sha256 FROM outputs WHERE job = ?1 AND name NOT LIKE 'input:%' ORDER BY name",
+    )?;
     named.query_map([job.to_string()], |row| row.get(0))?.collect()
 }
 

@@ -1,10 +1,11 @@
 //! Tables of the embedded engine, and how an older file becomes a newer one.
 
+use super::records::{IS_BLOB, NAME_INPUTS};
 use crate::engine::EngineError;
 use rusqlite::Connection;
 
 /// One step per version; `user_version` counts the steps that were taken. A step is never edited once released.
-const MIGRATIONS: [&str; 2] = [
+const MIGRATIONS: [&str; 3] = [
     "
     CREATE TABLE jobs (
         id          TEXT PRIMARY KEY,
@@ -61,7 +62,12 @@ const MIGRATIONS: [&str; 2] = [
     ALTER TABLE jobs ADD COLUMN kind TEXT NOT NULL DEFAULT 'shrink';
     ALTER TABLE jobs RENAME COLUMN shrink TO settings;
 ",
+    // the inputs of the jobs that are there are noted, which later jobs do as they come
+    "",
 ];
+
+/// The step after which the inputs of all jobs are in the table of what they name.
+const NOTES_INPUTS: usize = 2;
 
 /// Brings the file to this version.
 pub(super) fn migrate(connection: &mut Connection) -> Result<(), EngineError> {
@@ -72,6 +78,9 @@ pub(super) fn migrate(connection: &mut Connection) -> Result<(), EngineError> {
     for (i, step) in MIGRATIONS.iter().enumerate().skip(version) {
         let tx = connection.transaction()?;
         tx.execute_batch(step)?;
+        if i == NOTES_INPUTS {
+            tx.execute(&format!("{NAME_INPUTS} WHERE {IS_BLOB}"), [])?;
+        }
         tx.pragma_update(None, "user_version", i + 1)?;
         tx.commit()?;
     }
