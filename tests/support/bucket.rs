@@ -41,9 +41,19 @@ impl Bucket {
             assert!(Instant::now() < deadline, "{} does not listen", program.display());
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
-        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
+        let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
         let (address, delay) = (listener.local_addr().expect("an address"), Arc::new(AtomicU64::new(0)));
-        tokio::spawn(pass_on(listener, server, delay.clone()));
+        listener.set_nonblocking(true).expect("a socket");
+        // a thread of its own: tests wait for their services without giving way to other tasks
+        std::thread::spawn({
+            let delay = delay.clone();
+            move || {
+                let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
+                runtime.block_on(async {
+                    pass_on(tokio::net::TcpListener::from_std(listener).expect("a socket"), server, delay).await;
+                });
+            }
+        });
         let bucket = Self { child, address, delay };
         let made =
             reqwest::Client::new().put(format!("{}/shrinkd", bucket.endpoint())).send().await.expect("an answer");
