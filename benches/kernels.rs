@@ -41,6 +41,7 @@ fn network(widths: &[usize], activation: Activation) -> Network {
         let layer = Layer {
             weights: (0..outputs * previous).map(|_| random() * gain).collect(),
             bias: (0..outputs).map(|_| random() * 0.1).collect(),
+            norm: None,
             activation: if i < widths.len() { activation } else { Activation::Identity },
             skip: None,
         };
