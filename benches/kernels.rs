@@ -41,6 +41,7 @@ fn network(widths: &[usize], activation: Activation) -> Network {
         let layer = Layer {
             weights: (0..outputs * previous).map(|_| random() * gain).collect(),
             bias: (0..outputs).map(|_| random() * 0.1).collect(),
+            norm: None,
             activation: if i < widths.len() { activation } else { Activation::Identity },
             skip: None,
         };
@@ -187,7 +188,9 @@ fn main() {
     }
     criterion.final_summary();
 
-    println!("| network | points | us/point, one thread | GFLOP/s | of gemm's peak | us/point, {threads} threads | value only |");
+    println!(
+        "| network | points | us/point, one thread | GFLOP/s | of gemm's peak | us/point, {threads} threads | value only |"
+    );
     println!("|---|---:|---:|---:|---:|---:|---:|");
     for case in &cases {
         let seconds = ["gemm", ONE, ALL, ALONE].map(|mode| least.seconds(&case.name, mode));

@@ -69,6 +69,9 @@ def safetensors():
         skipped, dense(0, 4, 11) + dense(1, 4, 15) + dense(2, 1, 4) + [("latent_codes", [2, 2], "F32", wave(4))],
         latent_size=2, encoding={"positional": {"frequencies": 1, "base": 3.14}},
         domain={"min": [-1, -1, -1], "max": [1, 1, 2]}))
+    norm = [("layers.0.norm.scale", [4], "F32", wave(4)), ("layers.0.norm.shift", [4], "F64", wave(4))]
+    put("safetensors", "own_layer_norm", own([{"outputs": 4, "layer_norm": {"epsilon": 1e-5}, "activation": "relu"}, {"outputs": 1}],
+                                             dense(0, 4, 3) + norm + dense(1, 1, 4)))
     put("safetensors", "own_wrong_width", own([{"outputs": 4}, {"outputs": 1}], dense(0, 4, 3) + dense(1, 1, 5)))
     put("safetensors", "own_not_finite", own([{"outputs": 1}], [("layers.0.weight", [1, 3], "F32", [1, float("nan"), 0]),
                                                                ("layers.0.bias", [1], "F32", [0])]))
@@ -90,7 +93,9 @@ def safetensors():
     put("safetensors", "igr", tensors({}, lin("", [5, 4, 4, 1], skip=1)))
     put("safetensors", "deep_sdf", tensors({}, lin("decoder.", [5, 4, 4, 1], old, 1) + [("lat_vecs.weight", [2, 2], "F16", wave(4))]))
     put("safetensors", "deep_sdf_struct", tensors({}, lin("", [5, 4, 1], new)))
-    put("safetensors", "deep_sdf_layer_norm", tensors({}, lin("", [3, 4, 1]) + [("bn0.weight", [4], "F32", wave(4))]))
+    norm = [("bn0.weight", [4], "F32", wave(4)), ("bn0.bias", [4], "F32", wave(4))]
+    put("safetensors", "deep_sdf_layer_norm", tensors({}, lin("", [5, 4, 4, 1], skip=1) + norm))
+    put("safetensors", "deep_sdf_half_a_norm", tensors({}, lin("", [3, 4, 1]) + norm[:1]))
     put("safetensors", "idr", tensors({}, lin("implicit_network.", [9, 4, 3], old)))
     put("safetensors", "vol_sdf", tensors({}, lin("implicit_network.", [9, 4, 3], new) + [("density.beta", [1], "F32", [0.1])]))
     put("safetensors", "neus", tensors({}, lin("sdf_network_fine.", [9, 4, 3], old)))

@@ -181,7 +181,8 @@ fn untrained(spec: &FitSpec, shapes: usize) -> Network {
         let weights = (0..inputs * outputs).map(|_| number(reach)).collect();
         let bias = (0..outputs).map(|_| number(1.0 / fan.sqrt())).collect();
         let last = i == spec.layers as usize;
-        layers.push(Layer { weights, bias, activation: if last { Activation::Identity } else { activation }, skip });
+        let activation = if last { Activation::Identity } else { activation };
+        layers.push(Layer { weights, bias, norm: None, activation, skip });
         previous = outputs;
     }
     // codes begin near zero, of length about .1 (DeepSDF's code: 1 / sqrt(size), which is far from where they end)

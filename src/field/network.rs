@@ -15,6 +15,7 @@ mod evaluate;
 pub mod family;
 pub mod folder;
 mod functions;
+mod layer_norm;
 pub mod niq;
 pub mod onnx;
 mod passes;
@@ -26,6 +27,7 @@ pub(in crate::field) mod zip;
 
 pub use activation::Activation;
 pub use evaluate::NetworkField;
+pub use layer_norm::LayerNorm;
 
 use super::{Domain, FieldError, Metric};
 
@@ -35,7 +37,7 @@ pub const MAX_LAYERS: usize = 64;
 pub const MAX_WIDTH: usize = 8192;
 /// Most outputs of all layers together: every thread keeps a value and a derivative of each for a block of points.
 pub const MAX_UNITS: usize = 65_536;
-/// Most weights and biases together (256 MiB).
+/// Most weights and biases together, scales and shifts of norms included (256 MiB).
 pub const MAX_PARAMETERS: usize = 1 << 26;
 /// Most entries of a latent code.
 pub const MAX_LATENT: usize = 4096;
@@ -81,13 +83,15 @@ fn one() -> f32 {
     1.0
 }
 
-/// One dense layer: `activation(weights * input + bias)`.
+/// One dense layer: `activation(weights * input + bias)`, or `activation(norm(weights * input + bias))`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Layer {
     /// Row-major, one row of `inputs` weights per output.
     pub weights: Vec<f32>,
     /// One number per output.
     pub bias: Vec<f32>,
+    /// What is done to all outputs together before their activation; never on the last layer.
+    pub norm: Option<LayerNorm>,
     /// What is done to the outputs.
     pub activation: Activation,
     /// Whether the network's input is joined to the layer's; never on the first layer.
@@ -102,6 +106,18 @@ impl Layer {
     /// Number of inputs, those of a skip included.
     pub fn inputs(&self) -> usize {
         self.weights.len() / self.bias.len().max(1)
+    }
+    /// Number of weights and biases, and of scales and shifts of a norm.
+    pub fn parameters(&self) -> usize {
+        self.lists().map(Vec::len).sum()
+    }
+    /// The weights row by row, the biases, and the scales and shifts of a norm.
+    fn lists(&self) -> impl Iterator<Item = &Vec<f32>> {
+        [&self.weights, &self.bias].into_iter().chain(self.norm.iter().flat_map(|norm| [&norm.scale, &norm.shift]))
+    }
+    fn lists_mut(&mut self) -> impl Iterator<Item = &mut Vec<f32>> {
+        let norm = self.norm.iter_mut().flat_map(|norm| [&mut norm.scale, &mut norm.shift]);
+        [&mut self.weights, &mut self.bias].into_iter().chain(norm)
     }
 }
 
@@ -139,14 +155,14 @@ impl Network {
         }
     }
 
-    /// Number of weights and biases; latent codes are not counted.
+    /// Number of weights and biases, and of scales and shifts of norms; latent codes are not counted.
     pub fn parameters(&self) -> usize {
-        self.layers.iter().map(|layer| layer.weights.len() + layer.bias.len()).sum()
+        self.layers.iter().map(Layer::parameters).sum()
     }
 
-    /// All weights and biases: layer by layer, the weights row by row, then the biases.
+    /// All weights and biases: layer by layer, the weights row by row, then the biases, then the scales and the shifts of its norm.
     pub fn weights(&self) -> Vec<f32> {
-        self.layers.iter().flat_map(|layer| layer.weights.iter().chain(&layer.bias).copied()).collect()
+        self.layers.iter().flat_map(Layer::lists).flatten().copied().collect()
     }
 
     /// Replaces all weights and biases; the list is as [`Network::weights`] gives it.
@@ -156,7 +172,7 @@ impl Network {
     pub fn set_weights(&mut self, list: &[f32]) {
         assert_eq!(list.len(), self.parameters());
         let mut rest = list;
-        for part in self.layers.iter_mut().flat_map(|layer| [&mut layer.weights, &mut layer.bias]) {
+        for part in self.layers.iter_mut().flat_map(Layer::lists_mut) {
             let (taken, after) = rest.split_at(part.len());
             part.copy_from_slice(taken);
             rest = after;
@@ -234,6 +250,22 @@ impl Network {
             };
             finite(&layer.weights, "weights")?;
             finite(&layer.bias, "bias")?;
+            if let Some(norm) = &layer.norm {
+                let (scales, shifts, outputs) = (norm.scale.len(), norm.shift.len(), layer.outputs());
+                if i + 1 == self.layers.len() {
+                    return fault(format!("layer {i} has a layer norm, and the last layer cannot have one"));
+                }
+                if scales != outputs || shifts != outputs {
+                    return fault(format!(
+                        "the layer norm of layer {i} has {scales} scales and {shifts} shifts for {outputs} outputs"
+                    ));
+                }
+                if !(norm.epsilon > 0.0 && norm.epsilon.is_finite()) {
+                    return fault(format!("the epsilon of the layer norm of layer {i} is not a positive number"));
+                }
+                finite(&norm.scale, "scale of the layer norm")?;
+                finite(&norm.shift, "shift of the layer norm")?;
+            }
             previous = layer.outputs();
         }
         if previous != 1 {

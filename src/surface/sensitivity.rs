@@ -147,18 +147,25 @@ pub fn latent_motion(placed: &Placed, vertices: &[[f32; 3]], settings: &Settings
     Ok(motion)
 }
 
-/// The derivatives as a safetensors file: `latent` of the code's size, and for every layer `layers.i.weight` and `layers.i.bias`
-/// as in shrinkd's own files of networks (of a file with weight norm: by the weights that it gives).
+/// The derivatives as a safetensors file: `latent` of the code's size, and for every layer `layers.i.weight` and `layers.i.bias`, with a
+/// layer norm `layers.i.norm.scale` and `layers.i.norm.shift`, too, as in shrinkd's own files of networks (of a file with weight norm: by the
+/// weights that it gives).
 pub fn to_safetensors(placed: &Placed, made: &Sensitivity) -> Vec<u8> {
     let bytes = |list: &[f32]| list.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
     let mut tensors = vec![("latent".to_owned(), vec![made.latent.len()], bytes(&made.latent))];
     let mut rest = made.weights.as_slice();
-    for (i, layer) in placed.network.layers.iter().enumerate() {
-        let (weight, after) = rest.split_at(layer.weights.len());
-        let (bias, after) = after.split_at(layer.bias.len());
-        tensors.push((format!("layers.{i}.weight"), vec![layer.outputs(), layer.inputs()], bytes(weight)));
-        tensors.push((format!("layers.{i}.bias"), vec![layer.outputs()], bytes(bias)));
+    let mut put = |name: String, shape: &[usize]| {
+        let (list, after) = rest.split_at(shape.iter().product());
+        tensors.push((name, shape.to_vec(), bytes(list)));
         rest = after;
+    };
+    for (i, layer) in placed.network.layers.iter().enumerate() {
+        put(format!("layers.{i}.weight"), &[layer.outputs(), layer.inputs()]);
+        put(format!("layers.{i}.bias"), &[layer.outputs()]);
+        if layer.norm.is_some() {
+            put(format!("layers.{i}.norm.scale"), &[layer.outputs()]);
+            put(format!("layers.{i}.norm.shift"), &[layer.outputs()]);
+        }
     }
     let views = tensors.iter().map(|(name, shape, data)| {
         (name.as_str(), TensorView::new(Dtype::F32, shape.clone(), data).expect("as many bytes as the shape says"))

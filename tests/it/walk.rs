@@ -196,6 +196,18 @@ async fn a_network_gives_the_same_surface_from_pytorch_as_from_our_own_format_on
 }
 
 #[tokio::test]
+async fn a_deep_sdf_with_layer_norms_is_told_and_wrapped() {
+    let folder = tempfile::tempdir().expect("folder");
+    let app = App::start(folder.path());
+    let (description, job) = wrapped(&app, "families/two_lobes.pth", json!({"latent_row": 1})).await;
+    assert_eq!((&description["family"], &description["latent_rows"]), (&json!("deep_sdf"), &json!(2)), "{description}");
+    assert!(description["because"].as_str().is_some_and(|b| b.contains("layer norms")), "{description}");
+    assert!(description["assumed"].to_string().contains("1e-5"), "{description}");
+    assert_eq!(state(&job), "succeeded", "{job}");
+    assert_eq!(job["metrics"]["verdict"]["passed"], true, "{job}");
+}
+
+#[tokio::test]
 async fn an_uploaded_network_is_described_and_wrapped_for_a_latent_code() {
     let folder = tempfile::tempdir().expect("folder");
     let app = App::start(folder.path());

@@ -5,7 +5,8 @@
 Every model is built here from its published description (see src/field/network/family.rs), with random weights, and saved with
 torch.save in the layout of the family's own code. Beside NAME.pth (or NAME.zip, an experiment folder of DeepSDF) comes NAME.json: options,
 points, values and input gradients by autograd in double precision. The files in tests/fixtures/networks/families
-were written with 50 points; continuous integration writes them anew with 1,000.
+were written with 50 points; continuous integration writes them anew with 1,000. One model is trained here, for half a minute, because an extraction
+needs a shape.
 """
 
 import io
@@ -45,8 +46,9 @@ def normed(layer, new):
 class DeepSdf(nn.Module):
     """facebookresearch/DeepSDF and DeepSDFStruct: [code, xyz] in, joined again before some layers."""
 
-    def __init__(self, latent, width, depth, skip, *, struct=False, use_tanh=False, xyz_in_all=False, norm=True):
+    def __init__(self, latent, width, depth, skip, *, struct=False, use_tanh=False, xyz_in_all=False, norm=True, layer_norms=()):
         super().__init__()
+        self.layer_norms = layer_norms
         self.skip, self.depth, self.struct, self.use_tanh, self.xyz = skip, depth, struct, use_tanh, xyz_in_all
         start = latent + 3
         widths = [start] + [width] * depth + [1]
@@ -58,6 +60,8 @@ class DeepSdf(nn.Module):
                 outputs -= 3
             layer = linear(widths[l], outputs, 1.4)
             setattr(self, f"lin{l}", normed(layer, struct) if norm and (l < depth or struct) else layer)
+            if l in layer_norms:
+                setattr(self, f"bn{l}", nn.LayerNorm(outputs))
 
     def forward(self, latent, x):
         joined = torch.cat([latent, x], 1)
@@ -69,10 +73,50 @@ class DeepSdf(nn.Module):
                 h = torch.cat([h, x], 1)
             h = getattr(self, f"lin{l}")(h)
             if l < self.depth:
-                h = torch.relu(h)
+                # a norm of the last layer is in the file and goes unused
+                h = torch.relu(getattr(self, f"bn{l}")(h) if l in self.layer_norms else h)
             elif self.use_tanh:
                 h = torch.tanh(h)
         return h if self.struct else torch.tanh(h)
+
+
+def stirred(model):
+    """Layer norms begin as scales of one and shifts of zero, which would hide what is done with them."""
+    for name, part in model.named_children():
+        if name.startswith("bn"):
+            with torch.no_grad():
+                part.weight.normal_(1.0, 0.3)
+                part.bias.normal_(0.0, 0.2)
+    return model
+
+
+def two_lobes(points, size):
+    """The distance to two balls that run into each other, nearly; `size` from -1 to 1 makes the second one larger."""
+    one = (points - torch.tensor([-0.2, 0.0, 0.0])).norm(dim=1, keepdim=True) - 0.45
+    other = (points - torch.tensor([0.35, 0.2, 0.1])).norm(dim=1, keepdim=True) - (0.3 + 0.06 * size)
+    k = 0.2
+    h = (k - (one - other).abs()).clamp(min=0) / k
+    return torch.minimum(one, other) - h * h * k / 4
+
+
+def trained(model, steps=6000, batch=1024):
+    optimizer = torch.optim.Adam(model.parameters(), lr=4e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
+    for _ in range(steps):
+        points, size = 2 * torch.rand(batch, 3) - 1, 2 * torch.rand(batch, 1) - 1
+        with torch.no_grad():
+            # half of them near the surface
+            near = points[: batch // 2]
+            near /= near.norm(dim=1, keepdim=True) / 0.5
+            near += 0.15 * torch.randn(batch // 2, 3)
+        wanted = torch.tanh(two_lobes(points, size))
+        loss = ((model(size, points) - wanted) ** 2 / (0.01 + wanted**2)).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    print(f"two lobes: the loss is {loss.item():.1e} at the end")
+    return model
 
 
 class Siren(nn.Module):
@@ -254,6 +298,24 @@ put("neus", m, saved({"nerf": {"alpha_linear.weight": torch.zeros(1, 4)}, "sdf_n
 
 m = Implicit(0, 24, 0, False)
 put("igr", m, saved({"epoch": 5, "model_state_dict": module(m)}), expected="igr")
+
+# what came later is below, so that the models above keep their numbers
+m = stirred(DeepSdf(4, 25, 5, [3], norm=False, layer_norms=range(6)))
+put("deep_sdf_layer_norm", m, saved({"epoch": 9, "model_state_dict": module(m)}), options={"latent": code}, latent=code,
+    expected="deep_sdf", assumed=["ReLU", "tanh", "add 1e-5 to the variance", "norm of the last layer"])
+
+m = stirred(DeepSdf(4, 26, 4, [2], norm=False, layer_norms=[0, 1, 3]))
+rows = torch.randn(3, 4)
+put("deep_sdf_layer_norm_folder", m,
+    folder(specs(4, dims=[26] * 4, dropout=[0, 1, 2, 3], dropout_prob=0.2, norm_layers=[0, 1, 3], latent_in=[2],
+                 xyz_in_all=False, use_tanh=False, latent_dropout=False, weight_norm=False),
+           {"epoch": 9, "model_state_dict": module(m)}, {"epoch": 9, "latent_codes": {"weight": rows}}),
+    suffix=".zip", options={"latent_row": 1}, latent=rows[1].tolist(), expected="deep_sdf",
+    assumed=["add 1e-5 to the variance"])
+
+m = trained(DeepSdf(1, 24, 3, [2], norm=False, layer_norms=[0, 1, 2]))
+put("two_lobes", m, saved({"model_state_dict": module(m), "lat_vecs": {"weight": torch.tensor([[-1.0], [1.0]])}}),
+    options={"latent_row": 0}, latent=[-1.0], expected="deep_sdf")
 
 # two of the repository's own networks as others would have saved them, for extractions: their activation and w0 are not the usual
 from safetensors.torch import load_file  # noqa: E402

@@ -247,7 +247,7 @@ fn seeds_of_the_fuzz_targets_are_read_but_for_those_that_are_there_to_be_refused
         ("npy", &["cut", "integers", "not_finite", "too_many", "two_axes"]),
         (
             "safetensors",
-            &["deep_sdf_layer_norm", "long_header", "overflowing_shape", "own_not_finite", "own_wrong_width"],
+            &["deep_sdf_half_a_norm", "long_header", "overflowing_shape", "own_not_finite", "own_wrong_width"],
         ),
         ("scene", &["cut", "deep", "faults", "numbers"]),
     ];

@@ -2,10 +2,11 @@
 //!
 //! For every point somebody says what a loss changes by with the network's value there and, where asked for, with its gradient; the
 //! [`Sums`] gather the loss's derivatives by all weights. Gradients take no second derivatives by the point: b . grad f is the
-//! derivative of f along b, so one pass forward along b, and the pass back through it, are all there is to it.
+//! derivative of f along b, so one pass forward along b, and the pass back through it, are all there is to it. Layer norms have no
+//! such pass: a loss of gradients is what training has, and no network that is trained here has a norm.
 
 use super::Network;
-use super::passes::{Biases, Packed, TILES, decode, encode, encode_along, place};
+use super::passes::{Adjoint, Biases, ForBack, Packed, TILES, decode, encode, encode_along, place};
 use super::product::{Panels, Start, TILE, multiply, outer, outer_place, outer_scratch, outer_size, padded};
 use crate::field::Points;
 use std::ops::Range;
@@ -43,6 +44,28 @@ struct LayerSums {
     previous: Vec<f32>,
     point: Vec<f32>,
     bias: Vec<f32>,
+    /// By the scales and shifts of its norm, none where it has none.
+    scale: Vec<f32>,
+    shift: Vec<f32>,
+}
+
+impl LayerSums {
+    fn lists(&self) -> [&Vec<f32>; 5] {
+        [&self.previous, &self.point, &self.bias, &self.scale, &self.shift]
+    }
+
+    fn lists_mut(&mut self) -> [&mut Vec<f32>; 5] {
+        [&mut self.previous, &mut self.point, &mut self.bias, &mut self.scale, &mut self.shift]
+    }
+
+    /// Adds the derivatives by scale and shift of a tile: `adjoint` are those by what the norm gave, `kept` what it kept.
+    fn add_norm(&mut self, adjoint: &[f32], kept: &[f32]) {
+        let sums = self.scale.iter_mut().zip(&mut self.shift);
+        for ((scale, shift), (row, normed)) in sums.zip(adjoint.chunks_exact(TILE).zip(kept.chunks_exact(TILE))) {
+            *scale += row.iter().zip(normed).map(|(g, n)| g * n).sum::<f32>();
+            *shift += row.iter().sum::<f32>();
+        }
+    }
 }
 
 impl Sums {
@@ -52,10 +75,13 @@ impl Sums {
         let layers = network.layers.iter().enumerate().map(|(i, layer)| {
             let point = if network.sees_input(i) { network.encoding.size() } else { 0 };
             let rows = layer.outputs();
+            let normed = if layer.norm.is_some() { rows } else { 0 };
             let sums = LayerSums {
                 previous: vec![0.0; outer_size(rows, previous)],
                 point: vec![0.0; outer_size(rows, point)],
                 bias: vec![0.0; padded(rows)],
+                scale: vec![0.0; normed],
+                shift: vec![0.0; normed],
             };
             previous = rows;
             sums
@@ -71,19 +97,13 @@ impl Sums {
 
     /// Sets all sums to zero.
     pub fn clear(&mut self) {
-        for layer in &mut self.layers {
-            for list in [&mut layer.previous, &mut layer.point, &mut layer.bias] {
-                list.fill(0.0);
-            }
-        }
+        self.layers.iter_mut().flat_map(LayerSums::lists_mut).for_each(|list| list.fill(0.0));
     }
 
     /// Adds the sums of other points to these.
     pub fn merge(&mut self, other: &Self) {
         for (layer, from) in self.layers.iter_mut().zip(&other.layers) {
-            let lists =
-                [(&mut layer.previous, &from.previous), (&mut layer.point, &from.point), (&mut layer.bias, &from.bias)];
-            for (to, from) in lists {
+            for (to, from) in layer.lists_mut().into_iter().zip(from.lists()) {
                 to.iter_mut().zip(from).for_each(|(to, from)| *to += from);
             }
         }
@@ -104,18 +124,20 @@ impl Sums {
                     latent.iter_mut().zip(&own[previous..]).for_each(|(to, w)| *to += scale * sum * w);
                 }
             }
-            at += layer.weights.len() + layer.bias.len();
+            at += layer.parameters();
             previous = layer.outputs();
         }
     }
 
-    /// Adds the derivatives by all weights and biases to `weights`, but for those by the weights that meet a latent code.
+    /// Adds the derivatives by all weights, biases, scales and shifts to `weights`, in the order of [`Network::weights`], but for those by the weights that meet a latent code.
     pub fn add_to(&self, network: &Network, weights: &mut [f32]) {
         let (mut rest, mut previous) = (weights, 0);
         for (i, (layer, sums)) in network.layers.iter().zip(&self.layers).enumerate() {
             let (rows, inputs) = (layer.outputs(), layer.inputs());
             let (matrix, after) = rest.split_at_mut(rows * inputs);
             let (bias, after) = after.split_at_mut(rows);
+            let (norm_scale, after) = after.split_at_mut(sums.scale.len());
+            let (norm_shift, after) = after.split_at_mut(sums.shift.len());
             let scale = layer.skip.map_or(1.0, |s| s.scale);
             let point = if network.sees_input(i) { previous + network.latent_size } else { inputs };
             for (row, to) in matrix.chunks_exact_mut(inputs).enumerate() {
@@ -126,7 +148,9 @@ impl Sums {
                     *to += scale * sums.point[outer_place(rows, row, column)];
                 }
             }
-            bias.iter_mut().zip(&sums.bias).for_each(|(to, sum)| *to += sum);
+            for (to, sums) in [(bias, &sums.bias), (norm_scale, &sums.scale), (norm_shift, &sums.shift)] {
+                to.iter_mut().zip(sums).for_each(|(to, sum)| *to += sum);
+            }
             (rest, previous) = (after, rows);
         }
     }
@@ -140,6 +164,9 @@ impl<'n> Prepared<'n> {
 
     /// Adds to `sums` the derivatives of a loss of `points`, all seen with the latent code `code`. `loss` is told the place of up
     /// to [`BLOCK`] points, and what the network says there; gradients only where `gradients` asks for them.
+    ///
+    /// # Panics
+    /// When gradients are asked for of a network with layer norms.
     pub fn sum(
         &self,
         code: &[f32],
@@ -148,6 +175,7 @@ impl<'n> Prepared<'n> {
         sums: &mut Sums,
         mut loss: impl FnMut(Range<usize>, &mut Asked),
     ) {
+        assert!(!gradients || self.packed.kept() == 0, "no gradients of gradients through layer norms");
         let biases = Packed::fold(self.network, code);
         let mut scratch = std::mem::take(&mut sums.scratch);
         for start in (0..points.len()).step_by(BLOCK) {
@@ -171,25 +199,29 @@ impl<'n> Prepared<'n> {
         });
         let to_code: Vec<Panels> = to_code.collect();
         let of_code = TILE * padded(code.len());
-        let mut scratch = vec![0.0; TILE * (packed.point() + 2 * packed.units() + 2 * packed.widest()) + of_code];
+        let per_point = packed.point() + 2 * packed.units() + packed.kept() + 2 * packed.widest();
+        let mut scratch = vec![0.0; TILE * per_point + of_code];
         let (encoded, rest) = scratch.split_at_mut(TILE * packed.point());
         let (outputs, rest) = rest.split_at_mut(TILE * packed.units());
         let (slopes, rest) = rest.split_at_mut(TILE * packed.units());
+        let (kept, rest) = rest.split_at_mut(TILE * packed.kept());
         let (here, rest) = rest.split_at_mut(TILE * packed.widest());
         let (before, by_code) = rest.split_at_mut(TILE * packed.widest());
         for start in (0..points.len()).step_by(TILE) {
             let these = start..(start + TILE).min(points.len());
             place(points, these.clone(), encoded);
             encode(encoding, encoded);
-            packed.forward(&biases, 1, encoded, outputs, Some(&mut *slopes));
+            packed.forward(&biases, 1, encoded, outputs, Some(ForBack { slopes: &mut *slopes, kept: &mut *kept }));
             let last = TILE * padded(1);
             here[..last].copy_from_slice(&slopes[slopes.len() - last..]);
             by_code.fill(0.0);
             let finish = |at: usize, piece: &mut [f32]| {
                 piece.iter_mut().zip(&slopes[at..]).for_each(|(g, slope)| *g *= slope);
             };
-            packed.backward(1, None, here, before, finish, |i, adjoint| {
-                if !to_code[i].is_empty() {
+            packed.backward(1, kept, None, [here, before], finish, |i, adjoint| {
+                if let Adjoint::Sums(adjoint) = adjoint
+                    && !to_code[i].is_empty()
+                {
                     multiply(&[(&to_code[i], adjoint)], 1, Start::There, by_code, |_, _| {});
                 }
             });
@@ -217,7 +249,8 @@ impl<'n> Prepared<'n> {
         let (point, widest) = (tiles * TILE * packed.point(), tiles * TILE * packed.widest());
         let widest_input = packed.widest().max(packed.point());
         let turning = outer_scratch(widest_input, tiles);
-        scratch.resize(5 * all + 2 * point + 2 * widest + turning, 0.0);
+        let kept = tiles * TILE * packed.kept();
+        scratch.resize(5 * all + kept + 2 * point + 2 * widest + turning, 0.0);
         let mut rest = &mut scratch[..];
         let mut take = |size: usize| {
             let (taken, after) = std::mem::take(&mut rest).split_at_mut(size);
@@ -225,7 +258,7 @@ impl<'n> Prepared<'n> {
             taken
         };
         let (outputs, slopes, back, bend, tangents) = (take(all), take(all), take(all), take(all), take(all));
-        let (encoded, along) = (take(point), take(point));
+        let (kept, encoded, along) = (take(kept), take(point), take(point));
         let (here, before, turning) = (take(widest), take(widest), take(turning));
         let tile_of = |tile: usize| these.start + tile * TILE..(these.start + (tile + 1) * TILE).min(these.end);
         let size = TILE * packed.point();
@@ -233,7 +266,7 @@ impl<'n> Prepared<'n> {
             place(points, tile_of(tile), encoded);
             encode(encoding, encoded);
         }
-        packed.forward(biases, tiles, encoded, outputs, Some(&mut *slopes));
+        packed.forward(biases, tiles, encoded, outputs, Some(ForBack { slopes: &mut *slopes, kept: &mut *kept }));
 
         let end = all - tiles * TILE * padded(1);
         let asked = sums.asked.as_mut();
@@ -246,7 +279,7 @@ impl<'n> Prepared<'n> {
                 back[at..at + piece.len()].copy_from_slice(piece);
                 piece.iter_mut().zip(&slopes[at..]).for_each(|(g, slope)| *g *= slope);
             };
-            packed.backward(tiles, Some(&mut *along), here, before, finish, |_, _| {});
+            packed.backward(tiles, kept, Some(&mut *along), [&mut *here, &mut *before], finish, |_, _| {});
             for (tile, along) in along.chunks_exact_mut(size).enumerate() {
                 decode(encoding, &encoded[tile * size..], along);
             }
@@ -304,10 +337,19 @@ impl<'n> Prepared<'n> {
         };
         let mut offset = all;
         let layers = &mut sums.layers;
-        packed.backward(tiles, None, here, before, finish, |i, adjoint| {
-            offset -= adjoint.len();
+        packed.backward(tiles, kept, None, [here, before], finish, |i, adjoint| {
             let rows = self.network.layers[i].outputs();
             let sums = &mut layers[i];
+            let adjoint = match adjoint {
+                Adjoint::Normed(adjoint, kept) => {
+                    // one row more: what is behind the normalised outputs does not matter here
+                    let tiles = adjoint.chunks_exact(TILE * padded(rows)).zip(kept.chunks_exact(TILE * (rows + 1)));
+                    tiles.for_each(|(adjoint, kept)| sums.add_norm(adjoint, kept));
+                    return;
+                }
+                Adjoint::Sums(adjoint) => adjoint,
+            };
+            offset -= adjoint.len();
             for adjoint in adjoint.chunks_exact(TILE * padded(rows)) {
                 for (sum, row) in sums.bias.iter_mut().zip(adjoint.chunks_exact(TILE)) {
                     *sum += row.iter().sum::<f32>();

@@ -3,13 +3,14 @@
 //! Layer by layer, a block's outputs are the product of the weights with the block's inputs; derivatives of the activations
 //! are kept on the way, and one pass back through the transposed weights gives the gradient of the value with respect to
 //! the point (reverse mode: for one output it costs about one more forward pass, where three tangents would cost three).
-//! Activations are taken of every piece of a product as soon as it is there, while it is in the nearest cache.
+//! Activations are taken of every piece of a product as soon as it is there, while it is in the nearest cache; a norm waits for all
+//! outputs of its layer.
 //!
 //! Points come in tiles of [`TILE`], the last of which is filled up with copies of the last point. No number of a point depends
 //! on the others in its tile, so a point gets the same bits in every batch.
 
 use super::Network;
-use super::passes::{Biases, Packed, TILES, decode, encode, place};
+use super::passes::{Biases, ForBack, Packed, TILES, decode, encode, place};
 use super::product::{TILE, padded};
 use crate::field::{Domain, Field, Gradients, Metric, Points};
 use std::cell::RefCell;
@@ -42,10 +43,10 @@ impl NetworkField {
         }
     }
 
-    /// Numbers of scratch for a tile: the encoded points and their adjoint, all outputs and all derivatives, and two
-    /// adjoints of the widest layer.
+    /// Numbers of scratch for a tile: the encoded points and their adjoint, all outputs and all derivatives, what norms keep, and
+    /// two adjoints of the widest layer.
     fn scratch_size(&self) -> usize {
-        TILE * 2 * (self.packed.point() + self.packed.units() + self.packed.widest())
+        TILE * (2 * (self.packed.point() + self.packed.units() + self.packed.widest()) + self.packed.kept())
     }
 
     fn run(&self, points: Points<'_>, values: &mut [f32], mut gradients: Option<Gradients<'_>>) {
@@ -63,12 +64,14 @@ impl NetworkField {
                 let (encoded, rest) = scratch.split_at_mut(tiles * point);
                 let (outputs, rest) = rest.split_at_mut(tiles * TILE * units);
                 let (derivatives, rest) = rest.split_at_mut(tiles * TILE * units);
+                let (kept, rest) = rest.split_at_mut(tiles * TILE * packed.kept());
                 let places = |tile: usize| start + tile * TILE..(start + (tile + 1) * TILE).min(n);
                 for (tile, encoded) in encoded.chunks_exact_mut(point).enumerate() {
                     place(points, places(tile), encoded);
                     encode(encoding, encoded);
                 }
-                packed.forward(&self.biases, tiles, encoded, outputs, gradients.is_some().then_some(&mut *derivatives));
+                let back = gradients.is_some().then_some(ForBack { slopes: &mut *derivatives, kept: &mut *kept });
+                packed.forward(&self.biases, tiles, encoded, outputs, back);
                 let last = &outputs[tiles * TILE * (units - padded(1))..];
                 for (tile, value) in last.chunks_exact(TILE * padded(1)).enumerate() {
                     for (to, &from) in values[places(tile)].iter_mut().zip(value) {
@@ -85,7 +88,7 @@ impl NetworkField {
                 let finish = |at: usize, piece: &mut [f32]| {
                     piece.iter_mut().zip(&derivatives[at..]).for_each(|(g, slope)| *g *= slope);
                 };
-                packed.backward(tiles, Some(&mut *adjoint), here, before, finish, |_, _| {});
+                packed.backward(tiles, kept, Some(&mut *adjoint), [here, before], finish, |_, _| {});
                 for (tile, adjoint) in adjoint.chunks_exact_mut(point).enumerate() {
                     decode(encoding, &encoded[tile * point..], adjoint);
                     let columns = [&mut *gradients.x, &mut *gradients.y, &mut *gradients.z];

@@ -3,14 +3,15 @@
 //!
 //! | family | names | hidden layers | skip | output |
 //! |---|---|---|---|---|
-//! | DeepSDF (Park et al. 2019) | `lin{l}`, weight norm | ReLU | `[x, input]` | tanh, twice with `use_tanh` |
+//! | DeepSDF (Park et al. 2019) | `lin{l}`, weight norm or layer norms `bn{l}` | ReLU | `[x, input]` | tanh, twice with `use_tanh` |
 //! | DeepSDFStruct | the same with parametrizations | ReLU | `[x, input]` | as it is, tanh with `use_tanh` |
 //! | SIREN (Sitzmann et al. 2020) | `net.{i}.0` | sin(30 x), ReLU after its NeRF encoding | | as it is |
 //! | SIREN of lucidrains | `layers.{i}`, `last_layer` | sin(30 x), then sin(x) | | as it is |
 //! | IDR, VolSDF (Yariv et al. 2020, 2021) | `implicit_network.lin{l}` | softplus, beta 100 | `[x, input] / sqrt 2` | the first one |
 //! | NeuS (Wang et al. 2021) | `sdf_network_fine.lin{l}` | as IDR | as IDR | the first one |
-//! | IGR (Gropp et al. 2020) | `lin{l}` without weight norm | softplus, beta 100 | as IDR | as it is |
+//! | IGR (Gropp et al. 2020) | `lin{l}` without a norm | softplus, beta 100 | as IDR | as it is |
 
+mod norms;
 mod stack;
 
 use super::tensors::Tensors;
@@ -88,6 +89,10 @@ pub struct NetworkSpecs {
     /// Whether the last layer has a tanh of its own.
     #[serde(default)]
     pub use_tanh: bool,
+    /// Whether layers with a norm have weight norm, or else a layer norm.
+    pub weight_norm: Option<bool>,
+    /// The layers with a norm.
+    pub norm_layers: Option<Vec<usize>>,
     /// Coordinates of a point, which only DeepSDFStruct writes.
     pub geom_dimension: Option<usize>,
 }
@@ -126,30 +131,41 @@ pub fn read(
     let mut assumed = Vec::new();
     let inputs = stack.layers[0].inputs;
     let nerf = family == Family::SirenNerf;
+    check_norms(family, &stack, specs)?;
     let (encoding, latent_size) = input_of(family, inputs, specs, hints.encoding, &mut assumed)?;
     let activations = activations(family, &stack, specs, &mut assumed);
     let skip = skip_of(family);
     let mut layers = Vec::with_capacity(stack.layers.len() + 1);
     let mut previous = 0;
     let count = stack.layers.len();
+    let mut norms = false;
     for (i, (dense, activation)) in stack.layers.into_iter().zip(activations).enumerate() {
-        let dense = if i + 1 == count { first_output(family, dense)? } else { dense };
+        let mut dense = if i + 1 == count { first_output(family, dense)? } else { dense };
+        if i + 1 == count && dense.norm.take().is_some() {
+            // norm_layers may list the last layer, which then has a norm that the code of DeepSDF passes over
+            assumed.push("the layer norm of the last layer is not used".to_owned());
+        }
+        norms |= dense.norm.is_some();
         let outputs = dense.outputs;
         let layer = if i == 0 {
             let weights = if nerf { from_interleaved(&dense, encoding) } else { dense.weights };
-            Layer { weights, bias: dense.bias, activation, skip: None }
+            Layer { weights, bias: dense.bias, norm: dense.norm, activation, skip: None }
         } else {
             joined(dense, previous, (inputs, latent_size), activation, skip)?
         };
         layers.push(layer);
         previous = outputs;
     }
+    if norms {
+        assumed.push("layer norms add 1e-5 to the variance".to_owned());
+    }
     if layers.iter().any(|layer| layer.skip.is_some()) && skip.scale != 1.0 {
         assumed.push("the input joined to a layer is divided by sqrt 2 (`skip`)".to_owned());
     }
     if family == Family::DeepSdf && specs.is_some_and(|s| s.network.use_tanh) {
         // tanh of a tanh, as a layer that only has the second one
-        layers.push(Layer { weights: vec![1.0], bias: vec![0.0], activation: Activation::Tanh, skip: None });
+        let activation = Activation::Tanh;
+        layers.push(Layer { weights: vec![1.0], bias: vec![0.0], norm: None, activation, skip: None });
     }
     let latent_codes = match latent_size {
         0 => Vec::new(),
@@ -199,12 +215,36 @@ fn detect(tensors: &Tensors, stack: &Stack, specs: Option<&Specs>) -> Detected {
         Scheme::Lin if stack.normed => {
             of(Family::DeepSdf, format!("its layers are named like {shown:?}, with weight norm"))
         }
+        Scheme::Lin if stack.layers.iter().any(|layer| layer.norm.is_some()) => {
+            of(Family::DeepSdf, format!("its layers are named like {shown:?}, with layer norms"))
+        }
         Scheme::Lin => of(Family::Igr, format!("its layers are named like {shown:?}, without weight norm")),
     }
 }
 
 fn is_softplus(family: Family) -> bool {
     matches!(family, Family::Idr | Family::VolSdf | Family::Neus | Family::Igr)
+}
+
+/// Refuses layer norms where nothing says what they do, or where something else is said of them.
+fn check_norms(family: Family, stack: &Stack, specs: Option<&Specs>) -> Result<(), FieldError> {
+    let is_deep_sdf = matches!(family, Family::DeepSdf | Family::DeepSdfStruct);
+    if let Some(l) = stack.layers.iter().position(|layer| layer.norm.is_some()) {
+        if !is_deep_sdf {
+            let shown = &stack.shown;
+            let detail = format!("a layer norm \"bn{l}\" beside layers named like {shown:?}: only DeepSDF's are known");
+            return Err(FieldError::Unsupported { detail });
+        }
+        if stack.normed {
+            return Err(fault(format!(
+                "there is a layer norm \"bn{l}\" beside weight norm, and DeepSDF has one of them"
+            )));
+        }
+    }
+    match specs {
+        Some(specs) if is_deep_sdf => norms::check(&specs.network, &stack.layers, stack.normed),
+        _ => Ok(()),
+    }
 }
 
 /// The encoding and the size of the latent code that make so many inputs.
@@ -310,7 +350,7 @@ fn joined(
     activation: Activation,
     skip: Skip,
 ) -> Result<Layer, FieldError> {
-    let Dense { name, outputs, inputs: taken, weights, bias } = dense;
+    let Dense { name, outputs, inputs: taken, weights, bias, norm } = dense;
     let (weights, skip) = match taken.checked_sub(previous) {
         Some(0) => (weights, None),
         Some(extra) if extra == inputs => (weights, Some(skip)),
@@ -331,7 +371,7 @@ fn joined(
             )));
         }
     };
-    Ok(Layer { weights, bias, activation, skip })
+    Ok(Layer { weights, bias, norm, activation, skip })
 }
 
 /// Columns of SIREN's NeRF encoding, sine beside cosine for every coordinate, in the order of [`Encoding::Positional`].

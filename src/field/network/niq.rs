@@ -136,5 +136,5 @@ fn dense(bytes: &[u8], index: u32, operation: &Operation<'_>, left: &mut usize) 
         }
     }
     let bias = bias.into_iter().map(|b| b as f32).collect();
-    Ok(Layer { weights, bias, activation: Activation::Identity, skip: None })
+    Ok(Layer { weights, bias, norm: None, activation: Activation::Identity, skip: None })
 }

@@ -4,7 +4,7 @@
 //! another in the order of the layers. Offsets into such a run of numbers tell a layer's.
 
 use super::product::{Panels, Start, TILE, multiply, padded};
-use super::{Activation, Encoding, Network};
+use super::{Activation, Encoding, LayerNorm, Network};
 use crate::field::Points;
 use std::ops::Range;
 
@@ -22,6 +22,7 @@ struct Prepared {
     /// The transposes of both.
     to_previous: Panels,
     to_point: Panels,
+    norm: Option<LayerNorm>,
     activation: Activation,
 }
 
@@ -32,6 +33,24 @@ pub(super) struct Packed {
     /// Outputs of all layers together, and of the widest, with their padding.
     units: usize,
     widest: usize,
+    /// Numbers per point that norms keep for the way back.
+    kept: usize,
+}
+
+/// What the way back needs of a pass forward.
+pub(super) struct ForBack<'a> {
+    /// Derivatives of the activations; they lie as the outputs do.
+    pub slopes: &'a mut [f32],
+    /// What norms keep ([`LayerNorm::forward`]), layer by layer and tile after tile: [`Packed::kept`] numbers per point.
+    pub kept: &'a mut [f32],
+}
+
+/// What a pass back comes by, for one layer of a block.
+pub(super) enum Adjoint<'a> {
+    /// Where the layer has a norm: derivatives by what the norm gave, and what it kept.
+    Normed(&'a [f32], &'a [f32]),
+    /// Derivatives by the sums of weights times inputs, and bias.
+    Sums(&'a [f32]),
 }
 
 /// One bias per layer, with its padding and with a latent code folded in.
@@ -52,14 +71,17 @@ impl Packed {
                 let scale = layer.skip.map_or(1.0, |s| s.scale);
                 let weight = |row: usize, column: usize| scale * layer.weights[row * inputs + column];
                 let of_point = |row: usize, column: usize| weight(row, previous + network.latent_size + column);
+                // behind a norm, where an activation has no slope there still is one by its sums
+                let no_slopes = layer.activation.has_zeros() && layer.norm.is_none();
                 let prepared = Prepared {
                     outputs: padded(outputs),
                     from_previous: Panels::new(outputs, previous, weight).of_zeros(zeros),
                     from_point: Panels::new(outputs, seen, of_point),
                     to_previous: Panels::new(previous, if i == 0 { 0 } else { outputs }, |i, j| weight(j, i))
-                        .of_zeros(layer.activation.has_zeros()),
+                        .of_zeros(no_slopes),
                     to_point: Panels::new(point, if seen > 0 { outputs } else { 0 }, |i, j| of_point(j, i))
-                        .of_zeros(layer.activation.has_zeros()),
+                        .of_zeros(no_slopes),
+                    norm: layer.norm.clone(),
                     activation: layer.activation,
                 };
                 (previous, zeros) = (outputs, layer.activation.has_zeros());
@@ -69,6 +91,7 @@ impl Packed {
         Self {
             units: layers.iter().map(|l| l.outputs).sum(),
             widest: layers.iter().map(|l| l.outputs).max().unwrap_or(0),
+            kept: layers.iter().filter_map(|l| Some(l.norm.as_ref()?.kept())).sum(),
             layers,
             encoding: network.encoding,
         }
@@ -109,6 +132,11 @@ impl Packed {
         self.widest
     }
 
+    /// Numbers per point that norms keep for the way back: none where no layer has one.
+    pub fn kept(&self) -> usize {
+        self.kept
+    }
+
     /// Numbers of the encoded point, with their padding.
     pub fn point(&self) -> usize {
         padded(self.encoding.size())
@@ -119,32 +147,48 @@ impl Packed {
         self.layers.iter().map(|layer| (layer.activation, layer.outputs))
     }
 
-    /// Fills the outputs of every layer, and the derivatives of their activations where asked for.
+    /// Fills the outputs of every layer, and what the way back needs where it is asked for.
     pub fn forward(
         &self,
         biases: &Biases,
         tiles: usize,
         encoded: &[f32],
         outputs: &mut [f32],
-        mut derivatives: Option<&mut [f32]>,
+        mut back: Option<ForBack<'_>>,
     ) {
-        let (mut at, mut previous) = (0, 0);
+        let (mut at, mut previous, mut kept_at) = (0, 0, 0);
         for (layer, bias) in self.layers.iter().zip(biases) {
             let (before, rest) = outputs.split_at_mut(at);
             let size = tiles * TILE * layer.outputs;
-            let mut slopes = derivatives.as_deref_mut().map(|all| &mut all[at..at + size]);
-            let activate = |place: usize, piece: &mut [f32]| match slopes.as_deref_mut() {
+            let here = &mut rest[..size];
+            let (mut slopes, kept) = match &mut back {
+                Some(back) => (Some(&mut back.slopes[at..at + size]), Some(&mut back.kept[kept_at..])),
+                None => (None, None),
+            };
+            let mut activate = |place: usize, piece: &mut [f32]| match slopes.as_deref_mut() {
                 None => layer.activation.apply(piece),
                 Some(slopes) => layer.activation.apply_with_derivative(piece, &mut slopes[place..place + piece.len()]),
             };
             let parts = [(&layer.from_previous, &before[at - previous..]), (&layer.from_point, encoded)];
-            multiply(given(&parts), tiles, Start::Bias(bias), &mut rest[..size], activate);
+            match &layer.norm {
+                None => multiply(given(&parts), tiles, Start::Bias(bias), here, activate),
+                Some(norm) => {
+                    multiply(given(&parts), tiles, Start::Bias(bias), here, |_, _| {});
+                    let mut kept = kept.map(|kept| kept.chunks_exact_mut(TILE * norm.kept()));
+                    for (i, tile) in here.chunks_exact_mut(TILE * layer.outputs).enumerate() {
+                        norm.forward(tile, kept.as_mut().and_then(Iterator::next));
+                        activate(i * TILE * layer.outputs, tile);
+                    }
+                    kept_at += tiles * TILE * norm.kept();
+                }
+            }
             (at, previous) = (at + size, size);
         }
     }
 
     /// Carries a direction forward: `tangents` are the derivatives of all layers' outputs along it, `inner` those of what their
     /// activations were taken of, where `encoded` has that of the encoded points, and `derivatives` those of the activations.
+    /// Of networks without norms only.
     pub fn along(&self, tiles: usize, encoded: &[f32], derivatives: &[f32], inner: &mut [f32], tangents: &mut [f32]) {
         let (mut at, mut previous) = (0, 0);
         for layer in &self.layers {
@@ -160,23 +204,33 @@ impl Packed {
         }
     }
 
-    /// Carries derivatives back. `here` begins with those by what the last layer's activation was taken of; `finish` is shown every piece
-    /// of the derivatives by a layer's outputs, with its offset among all layers' numbers, and makes of it those by what its activation
-    /// was taken of; `each` is shown the latter, layer by layer. Derivatives by the encoded points are added to `adjoint`.
-    pub fn backward<'s>(
+    /// Carries derivatives back. `here` begins with those by what the last layer's activation was taken of, and `before` is as long; `finish`
+    /// is shown every piece of the derivatives by a layer's outputs, with its offset among all layers' numbers, and makes of it those by
+    /// what its activation was taken of; `each` is shown the latter, layer by layer, and before them those by what a norm gave. `kept` is
+    /// what norms kept on the way forward. Derivatives by the encoded points are added to `adjoint`.
+    pub fn backward(
         &self,
         tiles: usize,
+        kept: &[f32],
         mut adjoint: Option<&mut [f32]>,
-        mut here: &'s mut [f32],
-        mut before: &'s mut [f32],
+        [mut here, mut before]: [&mut [f32]; 2],
         mut finish: impl FnMut(usize, &mut [f32]),
-        mut each: impl FnMut(usize, &[f32]),
+        mut each: impl FnMut(usize, Adjoint<'_>),
     ) {
-        let mut end = tiles * TILE * self.units;
+        let (mut end, mut kept_end) = (tiles * TILE * self.units, tiles * TILE * self.kept);
         for (i, layer) in self.layers.iter().enumerate().rev() {
             let size = tiles * TILE * layer.outputs;
             end -= size;
-            each(i, &here[..size]);
+            if let Some(norm) = &layer.norm {
+                let rows = TILE * norm.kept();
+                let kept = &kept[kept_end - tiles * rows..kept_end];
+                kept_end -= tiles * rows;
+                each(i, Adjoint::Normed(&here[..size], kept));
+                for (tile, kept) in here[..size].chunks_exact_mut(TILE * layer.outputs).zip(kept.chunks_exact(rows)) {
+                    norm.backward(tile, kept);
+                }
+            }
+            each(i, Adjoint::Sums(&here[..size]));
             if let Some(adjoint) = adjoint.as_deref_mut()
                 && !layer.to_point.is_empty()
             {

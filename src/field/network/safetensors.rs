@@ -1,11 +1,12 @@
 //! shrinkd's own weight files: safetensors with the architecture as JSON in the metadata.
 //!
 //! The metadata member `architecture` holds an [`Architecture`]; layer i has the tensors `layers.i.weight` of shape
-//! `[outputs, inputs]` and `layers.i.bias` of shape `[outputs]`, and `latent_codes` of shape `[n, latent_size]` may come along.
+//! `[outputs, inputs]` and `layers.i.bias` of shape `[outputs]`, with a layer norm `layers.i.norm.scale` and `layers.i.norm.shift` of that
+//! shape, too, and `latent_codes` of shape `[n, latent_size]` may come along.
 //! Numbers are F32 or F64. `docs/networks.md` describes the format for those who write it.
 
 use super::tensors::{Tensor, Tensors, bfloat, half};
-use super::{Activation, Encoding, Layer, MAX_LAYERS, MAX_PARAMETERS, Network, Skip};
+use super::{Activation, Encoding, Layer, LayerNorm, MAX_LAYERS, MAX_PARAMETERS, Network, Skip, layer_norm};
 use crate::field::{Domain, FieldError, Metric};
 use safetensors::tensor::{Metadata, TensorView};
 use safetensors::{Dtype, SafeTensors};
@@ -52,12 +53,28 @@ fn bound() -> Metric {
 pub struct LayerSpec {
     /// Number of outputs.
     pub outputs: u32,
+    /// What is done to all outputs together before their activation.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub layer_norm: Option<LayerNormSpec>,
     /// What is done to the outputs; `identity` by default.
     #[serde(default)]
     pub activation: Activation,
     /// Whether the network's input is joined to the layer's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub skip: Option<Skip>,
+}
+
+/// A layer norm of a [`LayerSpec`].
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LayerNormSpec {
+    /// What is added to the variance; 1e-5 by default.
+    #[serde(default = "epsilon")]
+    pub epsilon: f32,
+}
+
+fn epsilon() -> f32 {
+    layer_norm::EPSILON
 }
 
 fn fault(at: Option<u64>, detail: String) -> FieldError {
@@ -151,7 +168,15 @@ fn read_own(metadata: &Metadata, tensors: &SafeTensors<'_>) -> Result<Network, F
                 format!("layer {i} has {outputs} outputs, its weight {rows} rows and its bias {biases} entries"),
             ));
         }
-        layers.push(Layer { weights, bias, activation: spec.activation, skip: spec.skip });
+        let norm = match spec.layer_norm {
+            None => None,
+            Some(LayerNormSpec { epsilon }) => {
+                let (_, scale) = take(format!("layers.{i}.norm.scale"), 1)?;
+                let (_, shift) = take(format!("layers.{i}.norm.shift"), 1)?;
+                Some(LayerNorm { scale, shift, epsilon })
+            }
+        };
+        layers.push(Layer { weights, bias, norm, activation: spec.activation, skip: spec.skip });
     }
     let latent_size = architecture.latent_size as usize;
     let latent_codes = if tensors.names().contains(&"latent_codes") {
@@ -203,8 +228,12 @@ fn numbers(name: &str, view: &TensorView<'_>) -> Result<Vec<f32>, FieldError> {
 
 /// Writes a network so that [`read`] gives it back. The same network gives the same bytes.
 pub fn write(network: &Network) -> Vec<u8> {
-    let spec =
-        |layer: &Layer| LayerSpec { outputs: layer.outputs() as u32, activation: layer.activation, skip: layer.skip };
+    let spec = |layer: &Layer| LayerSpec {
+        outputs: layer.outputs() as u32,
+        layer_norm: layer.norm.as_ref().map(|norm| LayerNormSpec { epsilon: norm.epsilon }),
+        activation: layer.activation,
+        skip: layer.skip,
+    };
     let architecture = Architecture {
         version: VERSION,
         layers: network.layers.iter().map(spec).collect(),
@@ -230,6 +259,10 @@ pub fn write(network: &Network) -> Vec<u8> {
     for (i, layer) in network.layers.iter().enumerate() {
         put(format!("layers.{i}.weight"), &[layer.outputs(), layer.inputs()], &layer.weights);
         put(format!("layers.{i}.bias"), &[layer.outputs()], &layer.bias);
+        if let Some(norm) = &layer.norm {
+            put(format!("layers.{i}.norm.scale"), &[norm.scale.len()], &norm.scale);
+            put(format!("layers.{i}.norm.shift"), &[norm.shift.len()], &norm.shift);
+        }
     }
     if network.latent_rows() > 0 {
         put("latent_codes".to_owned(), &[network.latent_rows(), network.latent_size], &network.latent_codes);

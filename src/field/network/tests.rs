@@ -49,6 +49,7 @@ fn made(
             let layer = Layer {
                 weights: random.by_ref().take(inputs * outputs).map(|r| r * gain).collect(),
                 bias: random.by_ref().take(outputs).map(|r| r * 0.1).collect(),
+                norm: None,
                 activation: if i < widths.len() { activation } else { Activation::Identity },
                 skip,
             };
@@ -57,6 +58,24 @@ fn made(
         })
         .collect();
     let network = Network { encoding, latent_size, ..Network::of_layers(layers) };
+    network.check("test").unwrap();
+    network
+}
+
+/// The network with a layer norm in every layer but the last.
+fn with_norms(mut network: Network) -> Network {
+    let mut random = numbers(23);
+    let hidden = network.layers.len() - 1;
+    for layer in &mut network.layers[..hidden] {
+        // a sine takes what is small
+        let size = if let Activation::Sine { w0 } = layer.activation { 1.5 / w0 } else { 1.0 };
+        let outputs = layer.outputs();
+        layer.norm = Some(LayerNorm {
+            scale: random.by_ref().take(outputs).map(|r| size * (1.0 + 0.5 * r)).collect(),
+            shift: random.by_ref().take(outputs).map(|r| size * 0.3 * r).collect(),
+            epsilon: 1e-5,
+        });
+    }
     network.check("test").unwrap();
     network
 }
@@ -78,32 +97,38 @@ fn plainly(network: &Network, latent: &[f32], p: [f64; 3]) -> f64 {
             h.extend(&input);
             h.iter_mut().for_each(|x| *x *= f64::from(skip.scale));
         }
-        h = layer
-            .weights
-            .chunks_exact(h.len())
-            .zip(&layer.bias)
-            .map(|(row, &b)| {
-                let x = f64::from(b) + row.iter().zip(&h).map(|(&w, x)| f64::from(w) * x).sum::<f64>();
-                match layer.activation {
-                    Activation::Identity => x,
-                    Activation::Relu => x.max(0.0),
-                    Activation::Elu => {
-                        if x > 0.0 {
-                            x
-                        } else {
-                            x.exp_m1()
-                        }
-                    }
-                    Activation::Tanh => x.tanh(),
-                    Activation::Sigmoid => 1.0 / (1.0 + (-x).exp()),
-                    Activation::Sine { w0 } => (f64::from(w0) * x).sin(),
-                    Activation::Softplus { beta } => {
-                        let t = f64::from(beta) * x;
-                        (t.max(0.0) + (-t.abs()).exp().ln_1p()) / f64::from(beta)
+        let rows = layer.weights.chunks_exact(h.len()).zip(&layer.bias);
+        h = rows
+            .map(|(row, &b)| f64::from(b) + row.iter().zip(&h).map(|(&w, x)| f64::from(w) * x).sum::<f64>())
+            .collect();
+        if let Some(norm) = &layer.norm {
+            let mean = h.iter().sum::<f64>() / h.len() as f64;
+            let variance = h.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / h.len() as f64;
+            let deviation = (variance + f64::from(norm.epsilon)).sqrt();
+            for ((x, &scale), &shift) in h.iter_mut().zip(&norm.scale).zip(&norm.shift) {
+                *x = f64::from(scale) * (*x - mean) / deviation + f64::from(shift);
+            }
+        }
+        for x in &mut h {
+            *x = match layer.activation {
+                Activation::Identity => *x,
+                Activation::Relu => x.max(0.0),
+                Activation::Elu => {
+                    if *x > 0.0 {
+                        *x
+                    } else {
+                        x.exp_m1()
                     }
                 }
-            })
-            .collect();
+                Activation::Tanh => x.tanh(),
+                Activation::Sigmoid => 1.0 / (1.0 + (-*x).exp()),
+                Activation::Sine { w0 } => (f64::from(w0) * *x).sin(),
+                Activation::Softplus { beta } => {
+                    let t = f64::from(beta) * *x;
+                    (t.max(0.0) + (-t.abs()).exp().ln_1p()) / f64::from(beta)
+                }
+            };
+        }
     }
     h[0]
 }
@@ -138,41 +163,44 @@ const ACTIVATIONS: [Activation; 8] = [
 ];
 
 #[test]
-fn every_activation_encoding_and_skip_gives_the_plain_value_and_its_gradient() {
+fn every_activation_encoding_skip_and_norm_gives_the_plain_value_and_its_gradient() {
     for activation in ACTIVATIONS {
         for (encoding, latent_size, skip) in [
             (Encoding::Identity, 0, None),
             (Encoding::Identity, 2, Some((2, 1.0))),
             (Encoding::Positional { frequencies: 3, base: std::f64::consts::PI }, 3, Some((1, 0.70710677))),
         ] {
-            let network = made(&[24, 17, 30], activation, encoding, latent_size, skip);
+            let plain = made(&[24, 17, 30], activation, encoding, latent_size, skip);
             let latent: Vec<f32> = numbers(9).take(latent_size).collect();
-            let field = network.field(&latent).unwrap();
-            for (p, (value, gradient)) in points(150).iter().zip(ask(&field, &points(150))) {
-                let p = p.map(f64::from);
-                let expected = plainly(&network, &latent, p);
-                let what = format!("{activation:?} {encoding:?} {latent_size} {skip:?} at {p:?}");
-                assert!(
-                    (f64::from(value) - expected).abs() < 2e-5 * expected.abs().max(1.0),
-                    "{value} {expected} {what}"
-                );
-                let slopes = |h: f64| {
-                    [0, 1, 2].map(|axis| {
-                        let at = |step: f64| {
-                            let mut q = p;
-                            q[axis] += step;
-                            plainly(&network, &latent, q)
-                        };
-                        (at(h) - at(-h)) / (2.0 * h)
-                    })
-                };
-                let (fine, coarse) = (slopes(1e-6), slopes(2e-6));
-                let size = fine.iter().fold(1.0f64, |m, g| m.max(g.abs()));
-                for axis in 0..3 {
-                    // a kink (ReLU) within the step shows in the two steps' disagreement
-                    if (fine[axis] - coarse[axis]).abs() < 1e-5 * size {
-                        let difference = (f64::from(gradient[axis]) - fine[axis]).abs();
-                        assert!(difference < 2e-4 * size, "{gradient:?} {fine:?} {what}");
+            for network in [with_norms(plain.clone()), plain] {
+                let field = network.field(&latent).unwrap();
+                for (p, (value, gradient)) in points(150).iter().zip(ask(&field, &points(150))) {
+                    let p = p.map(f64::from);
+                    let expected = plainly(&network, &latent, p);
+                    let norm = network.layers[0].norm.is_some();
+                    let what = format!("{activation:?} {encoding:?} {latent_size} {skip:?} {norm} at {p:?}");
+                    assert!(
+                        (f64::from(value) - expected).abs() < 2e-5 * expected.abs().max(1.0),
+                        "{value} {expected} {what}"
+                    );
+                    let slopes = |h: f64| {
+                        [0, 1, 2].map(|axis| {
+                            let at = |step: f64| {
+                                let mut q = p;
+                                q[axis] += step;
+                                plainly(&network, &latent, q)
+                            };
+                            (at(h) - at(-h)) / (2.0 * h)
+                        })
+                    };
+                    let (fine, coarse) = (slopes(1e-6), slopes(2e-6));
+                    let size = fine.iter().fold(1.0f64, |m, g| m.max(g.abs()));
+                    for axis in 0..3 {
+                        // a kink (ReLU) within the step shows in the two steps' disagreement
+                        if (fine[axis] - coarse[axis]).abs() < 1e-5 * size {
+                            let difference = (f64::from(gradient[axis]) - fine[axis]).abs();
+                            assert!(difference < 2e-4 * size, "{gradient:?} {fine:?} {what}");
+                        }
                     }
                 }
             }
@@ -182,13 +210,16 @@ fn every_activation_encoding_and_skip_gives_the_plain_value_and_its_gradient() {
 
 #[test]
 fn a_point_gets_the_same_bits_in_every_batch() {
-    let network = made(&[64, 64, 48], Activation::Elu, Encoding::Identity, 0, None);
-    let field = network.field(&[]).unwrap();
-    let all = points(700);
-    let together = ask(&field, &all);
-    for count in [1, 2, 5, 16, 47, 127, 128, 129, 300] {
-        for start in [0, 3, 131, 400] {
-            assert_eq!(ask(&field, &all[start..start + count]), together[start..start + count], "{start} {count}");
+    let plain = made(&[64, 64, 48], Activation::Elu, Encoding::Identity, 0, None);
+    let normed = with_norms(made(&[61, 64, 45], Activation::Relu, Encoding::Identity, 0, Some((1, 1.0))));
+    for network in [plain, normed] {
+        let field = network.field(&[]).unwrap();
+        let all = points(700);
+        let together = ask(&field, &all);
+        for count in [1, 2, 5, 16, 47, 127, 128, 129, 300] {
+            for start in [0, 3, 131, 400] {
+                assert_eq!(ask(&field, &all[start..start + count]), together[start..start + count], "{start} {count}");
+            }
         }
     }
 }
@@ -253,14 +284,31 @@ fn what_is_written_is_read_back() {
     network.lipschitz = Some(1.5);
     network.metric = Metric::Sign;
     network.domain = Domain { min: [-1.0, -2.0, -3.0], max: [1.0, 1.5, 0.1] };
-    let bytes = safetensors::write(&network);
-    assert_eq!(safetensors::read(&bytes).unwrap(), network);
-    assert_eq!(safetensors::write(&network), bytes);
+    for network in [with_norms(network.clone()), network] {
+        let bytes = safetensors::write(&network);
+        assert_eq!(safetensors::read(&bytes).unwrap(), network);
+        assert_eq!(safetensors::write(&network), bytes);
+    }
+}
+
+#[test]
+fn all_parameters_are_given_and_taken_in_one_order() {
+    let mut network = with_norms(made(&[8, 9], Activation::Relu, Encoding::Identity, 0, None));
+    let list: Vec<f32> = (0..network.parameters()).map(|i| i as f32).collect();
+    assert_eq!(list.len(), 8 * 3 + 3 * 8 + 9 * 8 + 3 * 9 + 9 + 1);
+    network.set_weights(&list);
+    assert_eq!(network.weights(), list);
+    let norm = network.layers[0].norm.as_ref().unwrap();
+    assert_eq!((network.layers[0].bias[0], norm.scale[0], norm.shift[0]), (24.0, 32.0, 40.0));
 }
 
 /// The architecture of a written network, changed.
 fn rewritten(change: impl Fn(&mut serde_json::Value)) -> Vec<u8> {
-    let bytes = safetensors::write(&made(&[8, 9], Activation::Relu, Encoding::Identity, 0, None));
+    rewritten_of(&made(&[8, 9], Activation::Relu, Encoding::Identity, 0, None), change)
+}
+
+fn rewritten_of(network: &Network, change: impl Fn(&mut serde_json::Value)) -> Vec<u8> {
+    let bytes = safetensors::write(network);
     let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
     let mut header: serde_json::Value = serde_json::from_slice(&bytes[8..8 + length]).unwrap();
     let mut architecture = serde_json::from_str(header["__metadata__"]["architecture"].as_str().unwrap()).unwrap();
@@ -287,6 +335,44 @@ fn an_architecture_that_does_not_fit_its_tensors_is_refused_by_name() {
         let error = safetensors::read(&rewritten(change)).unwrap_err().to_string();
         assert!(error.contains(expected), "{error}");
     }
+}
+
+#[test]
+fn a_layer_norm_that_does_not_fit_is_refused_by_name() {
+    type Change = fn(&mut serde_json::Value);
+    let plain = made(&[8, 9], Activation::Relu, Encoding::Identity, 0, None);
+    let normed = with_norms(plain.clone());
+    let without = |a: &mut serde_json::Value| _ = a["layers"][1].as_object_mut().unwrap().remove("layer_norm");
+    let cases: [(&Network, Change, &str); 6] = [
+        (&plain, |a| a["layers"][1]["layer_norm"] = serde_json::json!({}), "\"layers.1.norm.scale\" is missing"),
+        (&normed, |a| a["layers"][0]["layer_norm"]["epsilon"] = 0.into(), "the epsilon of the layer norm of layer 0"),
+        (
+            &normed,
+            |a| a["layers"][0]["layer_norm"]["epsilon"] = 1e300.into(),
+            "the epsilon of the layer norm of layer 0",
+        ),
+        (&normed, |a| a["layers"][0]["layer_norm"]["eps"] = 1.into(), "eps"),
+        (&normed, |a| a["layers"][0]["batch_norm"] = serde_json::json!({}), "batch_norm"),
+        (&normed, without, "\"layers.1.norm.scale\" belongs to no layer"),
+    ];
+    for (network, change, expected) in cases {
+        let error = safetensors::read(&rewritten_of(network, change)).unwrap_err().to_string();
+        assert!(error.contains(expected), "{error}");
+    }
+    let default = safetensors::read(&rewritten_of(&normed, |a| a["layers"][1]["layer_norm"] = serde_json::json!({})));
+    assert_eq!(default.unwrap(), normed);
+
+    let broken = |change: fn(&mut Network)| {
+        let mut network = normed.clone();
+        change(&mut network);
+        safetensors::read(&safetensors::write(&network)).unwrap_err().to_string()
+    };
+    let last = broken(|n| n.layers[2].norm = Some(LayerNorm { scale: vec![1.0], shift: vec![0.0], epsilon: 1e-5 }));
+    assert!(last.contains("layer 2 has a layer norm"), "{last}");
+    let short = broken(|n| n.layers[1].norm.as_mut().unwrap().shift.truncate(4));
+    assert!(short.contains("layer 1 has 9 scales and 4 shifts for 9 outputs"), "{short}");
+    let endless = broken(|n| n.layers[1].norm.as_mut().unwrap().scale[3] = f32::INFINITY);
+    assert!(endless.contains("number 3 of tensor \"layers.1.norm.scale\" is not finite"), "{endless}");
 }
 
 #[test]
@@ -331,7 +417,8 @@ proptest! {
     /// No cut and no change of bytes makes a loader panic.
     #[test]
     fn broken_bytes_never_panic(cut in any::<usize>(), changes in prop::collection::vec((any::<usize>(), any::<u8>()), 0..4)) {
-        for mut bytes in [fixture("blob.npz"), rewritten(|_| {})] {
+        let normed = with_norms(made(&[8, 9], Activation::Relu, Encoding::Identity, 0, None));
+        for mut bytes in [fixture("blob.npz"), rewritten(|_| {}), safetensors::write(&normed)] {
             for &(at, value) in &changes {
                 let at = at % bytes.len();
                 bytes[at] = value;

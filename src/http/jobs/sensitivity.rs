@@ -17,7 +17,7 @@ use std::collections::BTreeMap;
 /// The body is a safetensors file with the tensor `gradient`: the derivatives of a loss by the vertices of the job's output `surface`,
 /// `[vertices, 3]` for its welded vertices or `[rows, columns, 3]` for the points of its grid, F32 or F64. The answer is a job of the kind
 /// `sensitivity`, whose output `sensitivity` holds the derivatives by the latent code (`latent`) and by the weights
-/// (`layers.i.weight`, `layers.i.bias`).
+/// (`layers.i.weight`, `layers.i.bias`, with a layer norm `layers.i.norm.scale` and `layers.i.norm.shift`).
 #[utoipa::path(
     post,
     path = "/v1/jobs/{id}/sensitivity",

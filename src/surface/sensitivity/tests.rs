@@ -1,6 +1,6 @@
 use super::*;
 use crate::field::input::{FieldOptions, open_network};
-use crate::field::network::{Activation, Encoding, Layer, Network, safetensors as own};
+use crate::field::network::{Activation, Encoding, Layer, LayerNorm, Network, safetensors as own};
 use crate::field::{Domain, Metric};
 use crate::measure::fixtures::with_settings;
 
@@ -12,10 +12,11 @@ fn wave() -> Network {
             Layer {
                 weights: vec![1.0, 1.0, 0.0, 0.0],
                 bias: vec![0.0],
+                norm: None,
                 activation: Activation::Sine { w0: 1.0 },
                 skip: None,
             },
-            Layer { weights: vec![2.0], bias: vec![0.0], activation: Activation::Identity, skip: None },
+            Layer { weights: vec![2.0], bias: vec![0.0], norm: None, activation: Activation::Identity, skip: None },
         ],
         encoding: Encoding::Identity,
         latent_size: 1,
@@ -87,4 +88,31 @@ fn gradients_are_read_by_vertex_and_by_grid_point() {
     assert!(welded.gradient(&file(&[4, 3], &numbers)).unwrap_err().contains("takes [3, 3] or [2, 2, 3]"));
     assert!(welded.gradient(&file(&[1, 3], &[f64::NAN, 0.0, 0.0])).unwrap_err().contains("not finite"));
     assert!(welded.gradient(b"no safetensors").is_err());
+}
+
+#[test]
+fn derivatives_by_a_layer_norm_are_written_under_the_names_of_its_tensors() {
+    let mut network = wave();
+    let norm = LayerNorm { scale: vec![2.0, 1.0], shift: vec![0.5, 0.25], epsilon: 1e-5 };
+    let (weights, bias) = (vec![1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0], vec![0.0; 2]);
+    network.layers[0] = Layer { weights, bias, norm: Some(norm), activation: Activation::Tanh, skip: None };
+    network.layers[1].weights = vec![2.0, -1.0];
+    let placed = open_network(&own::write(&network), &FieldOptions::default()).unwrap().0;
+    // by all parameters in their order, the number of each
+    let made = Sensitivity { latent: vec![7.0], weights: (0..17).map(|i| i as f32).collect() };
+    let bytes = to_safetensors(&placed, &made);
+    let tensors = SafeTensors::deserialize(&bytes).unwrap();
+    for (name, shape, first) in [
+        ("latent", &[1][..], 7.0),
+        ("layers.0.weight", &[2, 4], 0.0),
+        ("layers.0.bias", &[2], 8.0),
+        ("layers.0.norm.scale", &[2], 10.0),
+        ("layers.0.norm.shift", &[2], 12.0),
+        ("layers.1.weight", &[1, 2], 14.0),
+        ("layers.1.bias", &[1], 16.0),
+    ] {
+        let (found, numbers) = floats(&tensors, name).unwrap();
+        assert_eq!((found.as_slice(), numbers[0]), (shape, first), "{name}");
+    }
+    assert_eq!(tensors.len(), 7);
 }

@@ -1,4 +1,4 @@
-use super::super::{Activation, Encoding, Layer, Skip};
+use super::super::{Activation, Encoding, Layer, LayerNorm, Skip};
 use super::*;
 use crate::field::{Domain, Metric};
 use crate::measure::sampling::Splitmix;
@@ -12,7 +12,7 @@ fn network(activation: Activation, encoding: Encoding) -> Network {
         let size = if activation == (Activation::Sine { w0: 30.0 }) { 0.05 } else { 1.0 / (inputs as f64).sqrt() };
         let mut number = || ((2.0 * random.unit() - 1.0) * size) as f32;
         let weights = (0..outputs * inputs).map(|_| number()).collect();
-        Layer { weights, bias: (0..outputs).map(|_| number()).collect(), activation, skip }
+        Layer { weights, bias: (0..outputs).map(|_| number()).collect(), norm: None, activation, skip }
     };
     let layers = vec![
         layer(19, input, activation, None),
@@ -24,6 +24,33 @@ fn network(activation: Activation, encoding: Encoding) -> Network {
     let network = Network { layers, encoding, latent_size, latent_codes: Vec::new(), domain, metric, lipschitz: None };
     network.check("test").unwrap();
     network
+}
+
+/// The network with a layer norm in every layer but the last.
+fn with_norms(mut network: Network) -> Network {
+    let mut random = Splitmix::new(11);
+    for layer in &mut network.layers[..3] {
+        // a sine of 30 x takes what is small
+        let size = if layer.activation == (Activation::Sine { w0: 30.0 }) { 0.05 } else { 1.0 };
+        let mut list = |middle: f64| {
+            (0..layer.bias.len()).map(|_| ((middle + random.unit() - 0.5) * size) as f32).collect::<Vec<_>>()
+        };
+        layer.norm = Some(LayerNorm { scale: list(1.0), shift: list(0.0), epsilon: 1e-3 });
+    }
+    network.check("test").unwrap();
+    network
+}
+
+/// Places of some parameters in the list of all: one of 37, and of a norm's one of 7.
+fn some(network: &Network) -> Vec<usize> {
+    let mut chosen: Vec<usize> = (0..network.parameters()).step_by(37).collect();
+    let mut at = 0;
+    for layer in &network.layers {
+        let dense = layer.weights.len() + layer.bias.len();
+        chosen.extend((at + dense..at + layer.parameters()).step_by(7));
+        at += layer.parameters();
+    }
+    chosen
 }
 
 const CODE: [f32; 5] = [0.3, -0.2, 0.5, 0.1, -0.4];
@@ -85,8 +112,9 @@ fn derivatives_by_weights_and_codes_are_those_of_finite_differences() {
             Activation::Sine { w0: 30.0 },
             Activation::Identity,
         ] {
-            for gradients in [false, true] {
-                let mut network = network(activation, encoding);
+            for (gradients, norms) in [(false, false), (true, false), (false, true)] {
+                let plain = network(activation, encoding);
+                let mut network = if norms { with_norms(plain) } else { plain };
                 // more than a block, and no whole number of tiles
                 let places = points(BLOCK + 77);
                 let (weights, latent) = derivatives(&network, &places, gradients);
@@ -94,7 +122,7 @@ fn derivatives_by_weights_and_codes_are_those_of_finite_differences() {
                 let largest = weights.iter().fold(0f32, |m, w| m.max(w.abs()));
                 // a sine of 30 x turns within a tenth
                 let step = if activation == (Activation::Sine { w0: 30.0 }) { 1e-4 } else { 2e-3 };
-                for at in (0..kept.len()).step_by(37) {
+                for at in some(&network) {
                     let mut moved = |by: f32| {
                         let mut list = kept.clone();
                         list[at] += by;
@@ -103,7 +131,7 @@ fn derivatives_by_weights_and_codes_are_those_of_finite_differences() {
                     };
                     let slope = (moved(step) - moved(-step)) / f64::from(2.0 * step);
                     let error = (slope - f64::from(weights[at])).abs();
-                    let what = format!("{activation:?} {encoding:?} {gradients} weight {at}");
+                    let what = format!("{activation:?} {encoding:?} {gradients} {norms} weight {at}");
                     assert!(error < 6e-3 * f64::from(largest), "{what}: {slope} {}", weights[at]);
                 }
                 network.set_weights(&kept);
@@ -116,9 +144,41 @@ fn derivatives_by_weights_and_codes_are_those_of_finite_differences() {
                     let slope = (moved(step) - moved(-step)) / f64::from(2.0 * step);
                     let error = (slope - f64::from(latent[at])).abs();
                     let largest = latent.iter().fold(0f32, |m, w| m.max(w.abs()));
-                    assert!(error < 6e-3 * f64::from(largest), "{activation:?} code {at}: {slope} {}", latent[at]);
+                    let what = format!("{activation:?} {gradients} {norms} code {at}");
+                    assert!(error < 6e-3 * f64::from(largest), "{what}: {slope} {}", latent[at]);
                 }
             }
         }
     }
+}
+
+#[test]
+fn derivatives_of_every_value_by_the_code_are_those_of_finite_differences() {
+    use crate::field::Field;
+    let plain = network(Activation::Tanh, Encoding::Identity);
+    for network in [with_norms(plain.clone()), plain] {
+        let [x, y, z] = &points(TILE + 5);
+        let places = Points { x, y, z };
+        let mut rows = vec![0.0; x.len() * CODE.len()];
+        Prepared::new(&network).by_code(&CODE, places, &mut rows);
+        let largest = rows.iter().fold(0f32, |m, d| m.max(d.abs()));
+        for at in 0..CODE.len() {
+            let moved = |by: f32| {
+                let (mut code, mut values) = (CODE, vec![0.0; x.len()]);
+                code[at] += by;
+                network.field(&code).unwrap().values(places, &mut values);
+                values
+            };
+            for (i, (ahead, behind)) in moved(2e-3).into_iter().zip(moved(-2e-3)).enumerate() {
+                let (slope, found) = ((ahead - behind) / 4e-3, rows[i * CODE.len() + at]);
+                assert!((slope - found).abs() < 5e-3 * largest, "point {i}, entry {at}: {slope} {found}");
+            }
+        }
+    }
+}
+
+#[test]
+#[should_panic(expected = "no gradients of gradients through layer norms")]
+fn a_loss_of_gradients_is_not_offered_with_layer_norms() {
+    derivatives(&with_norms(network(Activation::Tanh, Encoding::Identity)), &points(3), true);
 }

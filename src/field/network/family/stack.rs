@@ -1,9 +1,9 @@
 //! The dense layers of one network among the tensors of a file.
 
-use super::fault;
+use super::{fault, norms};
 use crate::field::FieldError;
 use crate::field::network::tensors::{Tensor, Tensors};
-use crate::field::network::{MAX_LAYERS, MAX_PARAMETERS};
+use crate::field::network::{LayerNorm, MAX_LAYERS, MAX_PARAMETERS};
 use std::collections::BTreeMap;
 
 /// How layers are named.
@@ -24,6 +24,7 @@ pub struct Dense {
     pub inputs: usize,
     pub weights: Vec<f32>,
     pub bias: Vec<f32>,
+    pub norm: Option<LayerNorm>,
 }
 
 /// The layers that were found.
@@ -119,15 +120,6 @@ impl Stack {
             let (found, limit) = (layers.len() as u64, MAX_LAYERS as u64);
             return Err(FieldError::Limit { what: "layers of a network", found, limit });
         }
-        let normed_without = tensors.keys().find(|name| {
-            let own = name.strip_prefix(prefix).unwrap_or(name).trim_start_matches('.');
-            own.strip_prefix("bn").is_some_and(|rest| rest.starts_with(|c: char| c.is_ascii_digit()))
-        });
-        if let Some(name) = normed_without {
-            let detail =
-                format!("a layer norm ({name:?}): an activation of all outputs of a layer together is not offered");
-            return Err(FieldError::Unsupported { detail });
-        }
         for (expected, (&number, parts)) in layers.iter().enumerate() {
             let last = scheme == Scheme::Layers && expected + 1 == layers.len();
             if number != expected && !(last && number == usize::MAX) {
@@ -141,7 +133,8 @@ impl Stack {
             (layers.values().any(|p| p.direction.is_some()), layers.values().any(|p| p.parametrized));
         let shown = layers.values().next().map_or("", |p| p.name).to_owned();
         let mut left = MAX_PARAMETERS;
-        let layers = layers.into_values().map(|parts| dense(&parts, &mut left)).collect::<Result<Vec<_>, _>>()?;
+        let mut layers = layers.into_values().map(|parts| dense(&parts, &mut left)).collect::<Result<Vec<_>, _>>()?;
+        norms::give(tensors, prefix, &mut layers)?;
         Ok(Self { scheme, prefix: prefix.to_owned(), shown, layers, normed, parametrized })
     }
 }
@@ -191,5 +184,5 @@ fn dense(parts: &Parts<'_>, left: &mut usize) -> Result<Dense, FieldError> {
     if bias.values.len() != outputs {
         return Err(fault(format!("{name:?} has {outputs} rows and {} biases", bias.values.len())));
     }
-    Ok(Dense { name: name.to_owned(), outputs, inputs, weights, bias: bias.values.clone() })
+    Ok(Dense { name: name.to_owned(), outputs, inputs, weights, bias: bias.values.clone(), norm: None })
 }

@@ -50,7 +50,7 @@ fn every_family_is_told_and_agrees_with_pytorch_in_value_and_gradient() {
     /// half of it PyTorch's own single precision is off by 9e-5 on these SIRENs.
     const SMALL: f64 = 2e-2;
     let cases = cases();
-    assert!(cases.len() >= 12);
+    assert!(cases.len() >= 15);
     for (expected, bytes) in cases {
         let file = &expected.file;
         let opened = input::open(&bytes, &expected.options).unwrap_or_else(|e| panic!("{file}: {e}"));
@@ -142,8 +142,6 @@ fn what_is_not_understood_is_refused_with_the_names_that_are_there_and_what_was_
     assert!(narrow.contains("\"lin1\" takes 9 inputs"), "{narrow}");
     let bare = refusal(&[("lin0.weight", &[1, 3])]);
     assert!(bare.contains("\"lin0\" has no bias"), "{bare}");
-    let norm = refusal(&[("lin0.weight", &[1, 3]), ("lin0.bias", &[1]), ("bn0.weight", &[1])]);
-    assert!(norm.contains("a layer norm (\"bn0.weight\")"), "{norm}");
     let wide = refusal(&[
         ("net.0.0.weight", &[4, 3]),
         ("net.0.0.bias", &[4]),
@@ -151,6 +149,90 @@ fn what_is_not_understood_is_refused_with_the_names_that_are_there_and_what_was_
         ("net.1.0.bias", &[3]),
     ]);
     assert!(wide.contains("3 outputs"), "{wide}");
+}
+
+/// A tensor's name and shape.
+type Named = (&'static str, &'static [usize]);
+
+/// Two layers with more tensors beside them.
+fn two_layers(more: &[Named]) -> Vec<Named> {
+    let layers: [Named; 4] =
+        [("a.lin0.weight", &[8, 3]), ("a.lin0.bias", &[8]), ("a.lin1.weight", &[1, 8]), ("a.lin1.bias", &[1])];
+    [&layers, more].concat()
+}
+
+#[test]
+fn layer_norms_that_do_not_fit_are_refused_by_name() {
+    let both: [Named; 2] = [("a.bn0.weight", &[8]), ("a.bn0.bias", &[8])];
+    let cases: [(&[Named], &str); 8] = [
+        (&[("a.bn0.weight", &[8])], "\"a.bn0\" has no bias"),
+        (&[("a.bn0.bias", &[8])], "\"a.bn0\" has no weight"),
+        (&[("a.bn0.weight", &[7]), ("a.bn0.bias", &[8])], "\"a.bn0.weight\" has the shape [7], and \"a.lin0\" has 8"),
+        (&[("a.bn0.weight", &[8]), ("a.bn0.bias", &[8, 1])], "\"a.bn0.bias\" has the shape [8, 1]"),
+        (&[both[0], both[1], ("a.bn2.weight", &[1])], "\"a.bn2.weight\" belongs to no layer"),
+        (&[both[0], both[1], ("a.bn00.bias", &[8])], "\"a.bn00.bias\" belongs to no layer"),
+        (&[both[0], both[1], ("a.bn0.running_mean", &[8])], "no layer norm (\"a.bn0.running_mean\")"),
+        (&[both[0], both[1], ("a.lin0.weight_v", &[8, 3]), ("a.lin0.weight_g", &[8, 1])], "\"bn0\" beside weight norm"),
+    ];
+    for (more, expected) in cases {
+        let error = refusal(&two_layers(more));
+        assert!(error.contains(expected), "{error}");
+    }
+    let siren: [Named; 5] = [
+        ("net.0.0.weight", &[8, 3]),
+        ("net.0.0.bias", &[8]),
+        ("net.1.0.weight", &[1, 8]),
+        ("net.1.0.bias", &[1]),
+        ("bn0.weight", &[8]),
+    ];
+    let error = refusal(&[&siren[..], &[("bn0.bias", &[8])]].concat());
+    assert!(error.contains("a layer norm \"bn0\" beside layers named like \"net.0.0\""), "{error}");
+}
+
+/// Reads two layers with layer norms of both, with what a specs.json says of their network.
+fn normed(specs: &str, norms: bool) -> Result<(super::Network, super::Detected), FieldError> {
+    let norm: [Named; 4] = [("a.bn0.weight", &[8]), ("a.bn0.bias", &[8]), ("a.bn1.weight", &[1]), ("a.bn1.bias", &[1])];
+    let list = two_layers(if norms { &norm } else { &[] });
+    let tensors: Tensors = list.into_iter().map(|(name, shape)| (name.to_owned(), tensor(shape))).collect();
+    let specs = (!specs.is_empty()).then(|| serde_json::from_str(specs).unwrap());
+    super::read(&tensors, None, specs.as_ref(), &super::Hints::default())
+}
+
+#[test]
+fn layer_norms_tell_a_deep_sdf_and_that_of_the_last_layer_is_passed_over() {
+    let (network, detected) = normed("", true).unwrap();
+    assert_eq!(detected.family, super::Family::DeepSdf);
+    assert!(detected.because.contains("with layer norms"), "{detected:?}");
+    let kept: Vec<bool> = network.layers.iter().map(|layer| layer.norm.is_some()).collect();
+    assert_eq!(kept, [true, false]);
+    assert_eq!(network.layers[0].norm.as_ref().unwrap().epsilon, 1e-5);
+    for said in ["layer norms add 1e-5 to the variance", "the layer norm of the last layer is not used"] {
+        assert!(detected.assumed.iter().any(|a| a == said), "{said}: {detected:?}");
+    }
+    assert_eq!(normed("", false).unwrap().1.family, super::Family::Igr);
+}
+
+#[test]
+fn layer_norms_that_a_specs_json_says_nothing_of_are_refused() {
+    let specs = |network: &str| format!(r#"{{"CodeLength": 0, "NetworkSpecs": {network}}}"#);
+    for (network, norms, expected) in [
+        (r#"{"weight_norm": true, "norm_layers": [0, 1]}"#, true, "specs.json has weight_norm"),
+        (r#"{"norm_layers": [1]}"#, true, "\"bn0\", and no 0 among norm_layers"),
+        (
+            r#"{"weight_norm": false, "norm_layers": [0]}"#,
+            false,
+            "0 among norm_layers, and there is no layer norm \"bn0\"",
+        ),
+    ] {
+        let error = normed(&specs(network), norms).unwrap_err().to_string();
+        assert!(error.contains(expected), "{error}");
+    }
+    // as many layers as the example of DeepSDF lists, whatever the network has
+    let listed = specs(r#"{"weight_norm": false, "norm_layers": [0, 1, 2, 3, 4, 5, 6, 7]}"#);
+    assert!(normed(&listed, true).unwrap().0.layers[0].norm.is_some());
+    for nothing in [r#"{}"#, r#"{"norm_layers": null}"#] {
+        assert!(normed(&specs(nothing), true).unwrap().0.layers[0].norm.is_some());
+    }
 }
 
 #[test]

@@ -285,6 +285,7 @@ impl Plan<'_> {
             let mut layer = Layer {
                 weights: vec![0.0; outputs * inputs],
                 bias: Vec::with_capacity(outputs),
+                norm: None,
                 activation,
                 skip: (sees_input && depth > 1).then_some(Skip { scale: 1.0 }),
             };
