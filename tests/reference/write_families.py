@@ -7,6 +7,7 @@ torch.save in the layout of the family's own code. Beside NAME.pth (or NAME.zip,
 points, values and input gradients by autograd in double precision. The files in tests/fixtures/networks/families
 were written with 50 points; `.ci/run` writes them anew with 1,000. One model is trained here, for half a minute, because an extraction
 needs a shape.
+needs a shape.
 """
 
 import io
