@@ -3,6 +3,7 @@
 //! In variables a level is two underscores: `SHRINKD_WORKER__SLOTS=4`. Unknown names are refused, in the file and in the
 //! environment. The defaults need nothing: one folder, loopback only.
 
+use crate::engine::nats::{Address, InvalidAddress};
 use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};
@@ -17,6 +18,9 @@ pub struct Config {
     pub listen: SocketAddr,
     /// Folder of the database and the blobs (`SHRINKD_DATA_DIR`), made when it is not there.
     pub data_dir: PathBuf,
+    /// Where jobs are kept (`SHRINKD_ENGINE`): `sqlite`, in the folder and for one process; or the
+    /// [address](crate::engine::nats::Address) of NATS servers, for any number of nodes. It may hold a password.
+    pub engine: String,
     /// Origins whose pages may call the service (`SHRINKD_CORS_ORIGINS`, a list); none.
     pub cors_origins: Vec<String>,
     /// Sizes of requests.
@@ -76,6 +80,7 @@ impl Default for Config {
         Self {
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
             data_dir: PathBuf::from("./shrinkd-data"),
+            engine: SQLITE.to_owned(),
             cors_origins: Vec::new(),
             limits: Limits { body_bytes: 1 << 20, input_bytes: 256 << 20 },
             worker: WorkerConfig { slots: 2, threads: 0, lease_s: 30, max_losses: 5 },
@@ -84,8 +89,12 @@ impl Default for Config {
     }
 }
 
-/// Variables of the project that are no settings of the service: test data, and the renewal of stored metrics.
-const NOT_SETTINGS: [&str; 2] = ["DATA", "RENEW_METRICS"];
+/// The embedded engine's name.
+pub const SQLITE: &str = "sqlite";
+
+/// Variables of the project that are no settings of the service: test data, the renewal of stored metrics, and the server
+/// that tests of the cluster start.
+const NOT_SETTINGS: [&str; 3] = ["DATA", "RENEW_METRICS", "NATS_SERVER"];
 
 impl Config {
     /// Reads the configuration; `flags` are what the command line says.
@@ -106,10 +115,13 @@ impl Config {
             (config.worker.max_losses == 0, "worker.max_losses must be at least 1"),
             (config.limits.body_bytes == 0 || config.limits.input_bytes == 0, "limits must be at least 1"),
         ];
-        match wrong.iter().find(|(is_wrong, _)| *is_wrong) {
-            Some((_, why)) => Err(ConfigError::Impossible(why)),
-            None => Ok(config),
+        if let Some((_, why)) = wrong.iter().find(|(is_wrong, _)| *is_wrong) {
+            return Err(ConfigError::Impossible(why));
         }
+        if config.engine != SQLITE {
+            config.engine.parse::<Address>()?;
+        }
+        Ok(config)
     }
 }
 
@@ -122,6 +134,9 @@ pub enum ConfigError {
     /// It asks for what cannot work.
     #[error("configuration: {0}")]
     Impossible(&'static str),
+    /// The engine is neither `sqlite` nor an address.
+    #[error("configuration: engine: {0}, or sqlite")]
+    Engine(#[from] InvalidAddress),
 }
 
 #[cfg(test)]
@@ -149,9 +164,12 @@ mod tests {
     fn unknown_names_and_impossible_values_are_refused() {
         let folder = tempfile::tempdir().expect("folder");
         let file = folder.path().join("shrinkd.toml");
-        for (text, named) in
-            [("lisen = \"x\"", "lisen"), ("[worker]\nslots = 0", "slots"), ("[log]\nformat = \"xml\"", "xml")]
-        {
+        for (text, named) in [
+            ("lisen = \"x\"", "lisen"),
+            ("[worker]\nslots = 0", "slots"),
+            ("[log]\nformat = \"xml\"", "xml"),
+            ("engine = \"http://a\"", "engine"),
+        ] {
             std::fs::write(&file, text).expect("writes");
             let error =
                 Config::load(Some(&file), figment::util::map!["log" => figment::util::map!["filter" => "info"]]);

@@ -1,10 +1,9 @@
 //! `shrinkd serve`: puts the rooms together and runs them until a signal comes.
 
+use super::open_engine::open_engine;
 use super::{BAD_USAGE, FAILED, ServeArgs, fail, first_job};
 use crate::blobs::Blobs;
 use crate::config::Config;
-use crate::engine::Engine;
-use crate::engine::sqlite::{SqliteEngine, Terms};
 use crate::http::{self, App};
 use crate::job::worker::Worker;
 use crate::telemetry;
@@ -27,11 +26,13 @@ struct Flags<'a> {
     listen: Option<std::net::SocketAddr>,
     #[serde(skip_serializing_if = "Option::is_none")]
     data_dir: Option<&'a std::path::Path>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    engine: Option<&'a str>,
 }
 
 /// Runs the service until SIGTERM or SIGINT.
 pub fn run(args: &ServeArgs) -> ExitCode {
-    let flags = Flags { listen: args.listen, data_dir: args.data.as_deref() };
+    let flags = Flags { listen: args.listen, data_dir: args.data.as_deref(), engine: args.engine.as_deref() };
     let config = match Config::load(args.config.as_deref(), flags) {
         Ok(config) => config,
         Err(error) => return fail(BAD_USAGE, &error),
@@ -53,8 +54,7 @@ pub fn run(args: &ServeArgs) -> ExitCode {
 }
 
 async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std::error::Error>> {
-    let terms = Terms { lease: Duration::from_secs(config.worker.lease_s), max_losses: config.worker.max_losses };
-    let engine: Arc<dyn Engine> = Arc::new(SqliteEngine::open(&config.data_dir, terms)?);
+    let engine = open_engine(&config).await?;
     let blobs = Blobs::in_folder(&config.data_dir.join("blobs"))?;
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(config.worker.threads)

@@ -12,10 +12,10 @@ use serde_json::json;
 use std::sync::Arc;
 
 /// Events kept per job. A reader that falls further behind starts over from a snapshot.
-const KEPT_EVENTS: u64 = 512;
+pub(in crate::engine) const KEPT_EVENTS: u64 = 512;
 
 /// A transaction of the writer.
-pub(super) struct Ctx<'a> {
+pub(in crate::engine) struct Ctx<'a> {
     /// The connection, inside its transaction.
     pub connection: &'a Connection,
     /// Milliseconds since the epoch.
@@ -39,7 +39,7 @@ impl Change {
 }
 
 /// A stored value that cannot be read.
-pub(super) fn corrupt(error: impl std::error::Error + Send + Sync + 'static) -> rusqlite::Error {
+pub(in crate::engine) fn corrupt(error: impl std::error::Error + Send + Sync + 'static) -> rusqlite::Error {
     rusqlite::Error::FromSqlConversionFailure(0, rusqlite::types::Type::Text, Box::new(error))
 }
 
@@ -47,7 +47,7 @@ pub(super) fn from_json<T: DeserializeOwned>(text: &str) -> rusqlite::Result<T> 
     serde_json::from_str(text).map_err(corrupt)
 }
 
-pub(super) fn to_json(value: &(impl Serialize + ?Sized)) -> rusqlite::Result<String> {
+pub(in crate::engine) fn to_json(value: &(impl Serialize + ?Sized)) -> rusqlite::Result<String> {
     serde_json::to_string(value).map_err(|e| rusqlite::Error::ToSqlConversionFailure(Box::new(e)))
 }
 
@@ -143,7 +143,7 @@ pub(super) fn named_blobs(connection: &Connection, job: JobId) -> rusqlite::Resu
     named.query_map([job.to_string()], |row| row.get(0))?.collect()
 }
 
-pub(super) fn list(connection: &Connection, query: &ListQuery) -> rusqlite::Result<Page> {
+pub(in crate::engine) fn list(connection: &Connection, query: &ListQuery) -> rusqlite::Result<Page> {
     let mut wanted = vec!["1".to_owned()];
     let mut values: Vec<Sql> = Vec::new();
     let mut bind = |value: Sql| -> String {
@@ -241,7 +241,7 @@ fn append(ctx: &mut Ctx<'_>, id: JobId, kind: EventKind, data: serde_json::Value
     Ok(())
 }
 
-pub(super) fn events_after(
+pub(in crate::engine) fn events_after(
     connection: &Connection,
     id: JobId,
     after: u64,

@@ -64,7 +64,7 @@ const MIGRATIONS: [&str; 2] = [
 ];
 
 /// Brings the file to this version.
-pub(super) fn migrate(connection: &mut Connection) -> Result<(), EngineError> {
+pub(in crate::engine) fn migrate(connection: &mut Connection) -> Result<(), EngineError> {
     let version: usize = connection.query_row("PRAGMA user_version", [], |row| row.get(0))?;
     if version > MIGRATIONS.len() {
         return Err(EngineError::Store(format!("the database is of version {version}, newer than this program")));

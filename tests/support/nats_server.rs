@@ -1,0 +1,114 @@
+//! A real NATS server under test: an own process, an own port, an own folder; killed when the test ends.
+//!
+//! The program is `$SHRINKD_NATS_SERVER`, or `nats-server` on the path, or what `tests/support/cluster_tools.sh` installed. Where
+//! there is none the test says so and is skipped; with `CI=true` it fails, so that the gate cannot pass without it.
+
+use std::io::Write as _;
+use std::net::{TcpListener, TcpStream};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// Longer than a server takes to start on the slowest machine.
+const START: Duration = Duration::from_secs(30);
+
+/// A running server.
+pub struct NatsServer {
+    child: Child,
+    program: PathBuf,
+    folder: tempfile::TempDir,
+    port: u16,
+}
+
+impl NatsServer {
+    /// Starts a server that syncs every message; `None` when there is no program and the test is to be skipped.
+    ///
+    /// # Panics
+    /// When it does not start, or when there is none and `CI` is `true`.
+    pub fn start() -> Option<Self> {
+        let Some(program) = program() else {
+            let hint = "no nats-server: run tests/support/cluster_tools.sh, or set SHRINKD_NATS_SERVER";
+            assert!(std::env::var("CI").as_deref() != Ok("true"), "{hint}");
+            eprintln!("skipped: {hint}");
+            return None;
+        };
+        let folder = tempfile::tempdir().expect("folder");
+        // taken for a moment, so that the same port is used again after a restart
+        let port = TcpListener::bind("127.0.0.1:0").and_then(|l| l.local_addr()).expect("a free port").port();
+        let mut file = std::fs::File::create(folder.path().join("nats.conf")).expect("writes");
+        write!(
+            file,
+            "listen: \"127.0.0.1:{port}\"\nmax_payload: 8MB\n\
+             jetstream {{ store_dir: \"{}\", sync_interval: always, max_mem: 256MB, max_file: 4GB }}\n",
+            folder.path().join("store").display()
+        )
+        .expect("writes");
+        let child = spawn(&program, folder.path());
+        let server = Self { child, program, folder, port };
+        server.wait();
+        Some(server)
+    }
+
+    /// Where it listens.
+    pub fn url(&self) -> String {
+        format!("nats://127.0.0.1:{}", self.port)
+    }
+
+    /// Its folder, in which a test may put more.
+    #[allow(dead_code, reason = "not every test that includes this file needs it")]
+    pub fn folder(&self) -> &Path {
+        self.folder.path()
+    }
+
+    /// Kills it without a warning.
+    #[allow(dead_code, reason = "not every test that includes this file needs it")]
+    pub fn kill(&mut self) {
+        self.child.kill().expect("kills");
+        self.child.wait().expect("ends");
+    }
+
+    /// Starts it again on the same port with the same store.
+    #[allow(dead_code, reason = "not every test that includes this file needs it")]
+    pub fn restart(&mut self) {
+        self.child = spawn(&self.program, self.folder.path());
+        self.wait();
+    }
+
+    fn wait(&self) {
+        let deadline = Instant::now() + START;
+        while TcpStream::connect(("127.0.0.1", self.port)).is_err() {
+            assert!(Instant::now() < deadline, "the server does not listen: {}", self.log());
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    fn log(&self) -> String {
+        std::fs::read_to_string(self.folder.path().join("nats.log")).unwrap_or_default()
+    }
+}
+
+impl Drop for NatsServer {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        if std::thread::panicking() {
+            eprintln!("the server's log:\n{}", self.log());
+        }
+    }
+}
+
+fn program() -> Option<PathBuf> {
+    if let Some(program) = std::env::var_os("SHRINKD_NATS_SERVER") {
+        return Some(program.into());
+    }
+    let on_path = std::env::var_os("PATH").unwrap_or_default();
+    let installed = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/cluster-tools/bin");
+    std::env::split_paths(&on_path).chain([installed]).map(|folder| folder.join("nats-server")).find(|p| p.is_file())
+}
+
+fn spawn(program: &Path, folder: &Path) -> Child {
+    let mut command = Command::new(program);
+    command.arg("-c").arg(folder.join("nats.conf")).arg("-l").arg(folder.join("nats.log"));
+    command.stdout(Stdio::null()).stderr(Stdio::null());
+    command.spawn().unwrap_or_else(|e| panic!("{} does not start: {e}", program.display()))
+}
