@@ -3,7 +3,6 @@
 //! The program is `$SHRINKD_NATS_SERVER`, or `nats-server` on the path, or what `tests/support/cluster_tools.sh` installed. Where
 //! there is none the test says so and is skipped; with `CI=true` it fails, so that the gate cannot pass without it.
 
-use std::io::Write as _;
 use std::net::{TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -26,38 +25,43 @@ impl NatsServer {
     /// # Panics
     /// When it does not start, or when there is none and `CI` is `true`.
     pub fn start() -> Option<Self> {
-        let Some(program) = program() else {
-            let hint = "no nats-server: run tests/support/cluster_tools.sh, or set SHRINKD_NATS_SERVER";
-            assert!(std::env::var("CI").as_deref() != Ok("true"), "{hint}");
-            eprintln!("skipped: {hint}");
-            return None;
-        };
-        let folder = tempfile::tempdir().expect("folder");
-        // taken for a moment, so that the same port is used again after a restart
-        let port = TcpListener::bind("127.0.0.1:0").and_then(|l| l.local_addr()).expect("a free port").port();
-        let mut file = std::fs::File::create(folder.path().join("nats.conf")).expect("writes");
-        write!(
-            file,
-            "listen: \"127.0.0.1:{port}\"\nmax_payload: 8MB\n\
-             jetstream {{ store_dir: \"{}\", sync_interval: always, max_mem: 256MB, max_file: 4GB }}\n",
-            folder.path().join("store").display()
-        )
-        .expect("writes");
-        let child = spawn(&program, folder.path());
-        let server = Self { child, program, folder, port };
+        let server = Self::begin(&program()?, free_port(), "");
         server.wait();
         Some(server)
+    }
+
+    /// Starts three servers that are one cluster, as [`start`](Self::start) does one.
+    #[allow(dead_code, reason = "not every test that includes this file needs it")]
+    pub fn start_three() -> Option<[Self; 3]> {
+        let program = program()?;
+        let routes = [(); 3].map(|()| free_port());
+        let urls = routes.map(|port| format!("\"nats://127.0.0.1:{port}\"")).join(", ");
+        let servers = [0, 1, 2].map(|i| {
+            let cluster = format!(
+                "server_name: n{i}\ncluster {{ name: test, listen: \"127.0.0.1:{}\", routes: [{urls}] }}\n",
+                routes[i]
+            );
+            Self::begin(&program, free_port(), &cluster)
+        });
+        servers.iter().for_each(Self::wait);
+        Some(servers)
+    }
+
+    fn begin(program: &Path, port: u16, more: &str) -> Self {
+        let folder = tempfile::tempdir().expect("folder");
+        let store = folder.path().join("store");
+        let config = format!(
+            "listen: \"127.0.0.1:{port}\"\nmax_payload: 8MB\n{more}\
+             jetstream {{ store_dir: \"{}\", sync_interval: always, max_mem: 256MB, max_file: 4GB }}\n",
+            store.display()
+        );
+        std::fs::write(folder.path().join("nats.conf"), config).expect("writes");
+        Self { child: spawn(program, folder.path()), program: program.to_owned(), folder, port }
     }
 
     /// Where it listens.
     pub fn url(&self) -> String {
         format!("nats://127.0.0.1:{}", self.port)
-    }
-
-    /// Its folder, in which a test may put more.
-    #[allow(dead_code, reason = "not every test that includes this file needs it")]
-    pub fn folder(&self) -> &Path {
-        self.folder.path()
     }
 
     /// Kills it without a warning.
@@ -97,13 +101,25 @@ impl Drop for NatsServer {
     }
 }
 
+/// A port that is free now. It is given back at once, so that the server can have it, and have it again after a restart.
+fn free_port() -> u16 {
+    TcpListener::bind("127.0.0.1:0").and_then(|listener| listener.local_addr()).expect("a free port").port()
+}
+
 fn program() -> Option<PathBuf> {
     if let Some(program) = std::env::var_os("SHRINKD_NATS_SERVER") {
         return Some(program.into());
     }
     let on_path = std::env::var_os("PATH").unwrap_or_default();
     let installed = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/cluster-tools/bin");
-    std::env::split_paths(&on_path).chain([installed]).map(|folder| folder.join("nats-server")).find(|p| p.is_file())
+    let mut places = std::env::split_paths(&on_path).chain([installed]).map(|folder| folder.join("nats-server"));
+    let found = places.find(|program| program.is_file());
+    if found.is_none() {
+        let hint = "no nats-server: run tests/support/cluster_tools.sh, or set SHRINKD_NATS_SERVER";
+        assert!(std::env::var("CI").as_deref() != Ok("true"), "{hint}");
+        eprintln!("skipped: {hint}");
+    }
+    found
 }
 
 fn spawn(program: &Path, folder: &Path) -> Child {

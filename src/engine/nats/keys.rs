@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 
 /// What a key was used for.
 #[derive(Serialize, Deserialize)]
-struct Used {
+pub(super) struct Used {
     fingerprint: String,
     /// The job as it is accepted, which is the answer to every repetition.
     job: Job,
@@ -41,12 +41,12 @@ pub(super) async fn submit(ledger: &Ledger, mut new: NewJob) -> Result<Submitted
 }
 
 /// Takes a key for a job; what it was used for, where it was.
-async fn reserve(ledger: &Ledger, key: &IdempotencyKey, job: Job) -> Result<Option<Used>, EngineError> {
+pub(super) async fn reserve(ledger: &Ledger, key: &IdempotencyKey, job: Job) -> Result<Option<Used>, EngineError> {
     let used = Used { fingerprint: key.fingerprint.clone(), job };
     let payload = Bytes::from(serde_json::to_vec(&used).map_err(|e| failed("a key")(e.into()))?);
     loop {
         let subject = ledger.layout.key(&key.key);
-        if ledger.link.store(subject, payload.clone(), Expect::Nothing).await? != Store::Conflict {
+        if ledger.link.store(&ledger.layout.keys, subject, payload.clone(), Expect::Nothing).await? != Store::Conflict {
             return Ok(None);
         }
         // one that ran out in this moment is taken after all

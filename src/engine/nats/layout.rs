@@ -17,11 +17,11 @@ use sha2::{Digest, Sha256};
 use std::time::Duration;
 use tracing::warn;
 
-/// Entries kept per job. A reader that falls further behind starts over from a snapshot.
+/// Entries kept per job, heartbeats among them. A reader that falls further behind starts over from a snapshot.
 const KEPT_ENTRIES: i64 = 512;
 /// How long an idempotency key is kept.
 pub(super) const KEY_LIFETIME: Duration = Duration::from_secs(24 * 60 * 60);
-/// How long a repeated message is told from a new one: longer than anyone repeats it.
+/// How long the servers remember the ids of messages, so that an id put into the queue twice is there once.
 const REPETITIONS: Duration = Duration::from_secs(60);
 /// How long a claimed id may wait for its record to be changed before another worker gets it. It is no lease: the id is gone
 /// from the queue as soon as the record says who runs the job.

@@ -55,8 +55,16 @@ impl Ledger {
             }
             Entry::Forgotten { .. } => Found::Forgotten,
         };
-        self.projection.apply(vec![(stored.seq, id, entry)]).await?;
+        self.project(stored.seq, id, entry).await;
         Ok(found)
+    }
+
+    /// Tells this node's projection what was read or stored. Where that fails the feed tries it again, and what is stored
+    /// stands.
+    async fn project(&self, seq: u64, id: JobId, entry: Entry) {
+        if let Err(error) = self.projection.apply(vec![(seq, id, entry)]).await {
+            tracing::error!(job.id = %id, %error, "the node's own view of the jobs cannot be written");
+        }
     }
 
     /// The version of a job that is there.
@@ -107,10 +115,10 @@ impl Ledger {
         let record = Arc::new(draft.record.clone());
         let entry = draft.entry();
         let payload = entry.write().map_err(|e| failed("a record")(e.into()))?;
-        match self.link.store(self.layout.job(id), payload, expect).await? {
+        match self.link.store(&self.layout.jobs, self.layout.job(id), payload, expect).await? {
             Store::Conflict => Ok(None),
             Store::Done(seq) => {
-                self.projection.apply(vec![(seq, id, entry)]).await?;
+                self.project(seq, id, entry).await;
                 Ok(Some(record))
             }
         }
@@ -120,7 +128,7 @@ impl Ledger {
     pub(super) async fn create(&self, new: &NewJob, created_at: Timestamp) -> Result<Option<Arc<Record>>, EngineError> {
         let spec = serde_json::to_vec(&new.spec).map_err(|e| failed("a request")(e.into()))?;
         // one that is there already is the same: its name is given once
-        self.link.store(self.layout.spec(new.id), spec.into(), Expect::Nothing).await?;
+        self.link.store(&self.layout.specs, self.layout.spec(new.id), spec.into(), Expect::Nothing).await?;
         self.write(new.id, Draft::accepted(new, created_at), Expect::Nothing).await
     }
 
@@ -134,10 +142,12 @@ impl Ledger {
     pub(super) async fn forget(&self, id: JobId, from: &Version) -> Result<Option<u64>, EngineError> {
         let entry = Entry::Forgotten { at: now() };
         let payload = entry.write().map_err(|e| failed("a record")(e.into()))?;
-        let Store::Done(seq) = self.link.store(self.layout.job(id), payload, Expect::Replace(from.seq)).await? else {
+        let Store::Done(seq) =
+            self.link.store(&self.layout.jobs, self.layout.job(id), payload, Expect::Replace(from.seq)).await?
+        else {
             return Ok(None);
         };
-        self.projection.apply(vec![(seq, id, entry)]).await?;
+        self.project(seq, id, entry).await;
         if let Err(error) = self.layout.specs.purge().filter(self.layout.spec(id)).await {
             // the housekeeping will find it
             tracing::warn!(job.id = %id, %error, "the request of a forgotten job is still there");

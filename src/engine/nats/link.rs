@@ -1,15 +1,18 @@
 //! The connection, and the three things done over it: store a message, read a subject's newest one, and wait no longer than
 //! anyone would.
 //!
-//! Storing is repeated until it is known to have worked: a message carries an id by which the server tells a repetition, so a
-//! broken connection or a new leader in the middle leaves no doubt and no second copy.
+//! Storing is repeated until it is known whether it worked, so a broken connection or a new leader in the middle leaves no
+//! doubt and no second copy. A message carries an id for that: when a repetition is refused because the subject has moved on,
+//! the message that moved it on is looked at, and may be our own. (The servers' own memory of ids does not help, because they
+//! look at what is expected first.)
 
 use super::address::Address;
 use crate::engine::EngineError;
 use async_nats::connection::State;
 use async_nats::header::{NATS_EXPECTED_LAST_SUBJECT_SEQUENCE, NATS_MESSAGE_ID, NATS_ROLLUP};
 use async_nats::jetstream::context::PublishErrorKind;
-use async_nats::jetstream::stream::{LastRawMessageErrorKind, Stream};
+use async_nats::jetstream::message::StreamMessage;
+use async_nats::jetstream::stream::{LastRawMessageErrorKind, RawMessageError, Stream};
 use async_nats::jetstream::{self, Context, ErrorCode};
 use async_nats::{Client, ConnectOptions, HeaderMap};
 use bytes::Bytes;
@@ -148,9 +151,36 @@ impl Link {
     ///
     /// # Errors
     /// When it can never be stored, such as when it is too large.
-    pub(super) async fn store(&self, subject: String, payload: Bytes, expect: Expect) -> Result<Store, EngineError> {
+    pub(super) async fn store(
+        &self,
+        stream: &Stream<()>,
+        subject: String,
+        payload: Bytes,
+        expect: Expect,
+    ) -> Result<Store, EngineError> {
+        let id = Uuid::now_v7().to_string();
+        let mut is_repetition = false;
+        loop {
+            if let Some(stored) = self.store_once(stream, &subject, &payload, expect, &id, is_repetition).await? {
+                return Ok(stored);
+            }
+            is_repetition = true;
+            tokio::time::sleep(PAUSE).await;
+        }
+    }
+
+    /// One try to store a message under an id, perhaps after others; `None` when nobody knows what became of it.
+    pub(super) async fn store_once(
+        &self,
+        stream: &Stream<()>,
+        subject: &str,
+        payload: &Bytes,
+        expect: Expect,
+        id: &str,
+        is_repetition: bool,
+    ) -> Result<Option<Store>, EngineError> {
         let mut headers = HeaderMap::new();
-        headers.insert(NATS_MESSAGE_ID, Uuid::now_v7().to_string());
+        headers.insert(NATS_MESSAGE_ID, id);
         let newest = match expect {
             Expect::Any => None,
             Expect::Nothing => Some(0),
@@ -162,59 +192,71 @@ impl Link {
         if matches!(expect, Expect::Replace(_)) {
             headers.insert(NATS_ROLLUP, "sub");
         }
-        loop {
-            let sent = self.context.publish_with_headers(subject.clone(), headers.clone(), payload.clone()).await;
-            let error = match sent {
-                Ok(acknowledged) => match acknowledged.await {
-                    Ok(acknowledged) => return Ok(Store::Done(acknowledged.sequence)),
-                    Err(error) => error,
-                },
-                Err(error) => error,
-            };
-            match error.kind() {
-                PublishErrorKind::WrongLastSequence => return Ok(Store::Conflict),
-                PublishErrorKind::TimedOut | PublishErrorKind::StreamNotFound | PublishErrorKind::BrokenPipe => {}
-                PublishErrorKind::Other => match code(&error) {
-                    Some(ErrorCode::STREAM_WRONG_LAST_SEQUENCE_CONSTANT) => return Ok(Store::Conflict),
-                    // the stream has no leader at the moment, or the disk is slow
-                    Some(_) | None if is_passing(&error) => {}
-                    _ => return Err(failed("a message was refused")(error.into())),
-                },
-                _ => return Err(failed("a message was refused")(error.into())),
-            }
-            tokio::time::sleep(PAUSE).await;
+        let sent = self.context.publish_with_headers(subject.to_owned(), headers, payload.clone()).await;
+        let acknowledged = match sent {
+            Ok(acknowledgement) => acknowledgement.await,
+            Err(error) => Err(error),
+        };
+        let error = match acknowledged {
+            Ok(acknowledgement) => return Ok(Some(Store::Done(acknowledgement.sequence))),
+            Err(error) => error,
+        };
+        let is_conflict = match error.kind() {
+            PublishErrorKind::WrongLastSequence => true,
+            PublishErrorKind::TimedOut | PublishErrorKind::StreamNotFound | PublishErrorKind::BrokenPipe => false,
+            PublishErrorKind::Other => match server_error(&error) {
+                Some(refusal) if refusal.error_code() == ErrorCode::STREAM_WRONG_LAST_SEQUENCE_CONSTANT => true,
+                // the stream has no leader at the moment, or the disk is full or slow
+                Some(refusal) if refusal.code() < 500 => return Err(failed("a message was refused")(error.into())),
+                _ => false,
+            },
+            _ => return Err(failed("a message was refused")(error.into())),
+        };
+        if !is_conflict {
+            return Ok(None);
         }
+        if is_repetition {
+            // what was expected to be the newest was followed by exactly one message: an earlier try of this one, or another
+            let next = newest.unwrap_or(0) + 1;
+            let follower = ask(|| stream.get_first_raw_message_by_subject(subject, next)).await?;
+            if let Some(follower) = follower
+                && follower.headers.get(NATS_MESSAGE_ID).is_some_and(|found| found.as_str() == id)
+            {
+                return Ok(Some(Store::Done(follower.sequence)));
+            }
+        }
+        Ok(Some(Store::Conflict))
     }
 
     /// The newest message of a subject, as the stream's leader has it: what was stored before is seen, whoever stored it.
     pub(super) async fn newest(&self, stream: &Stream<()>, subject: &str) -> Result<Option<Stored>, EngineError> {
-        loop {
-            let error = match stream.get_last_raw_message_by_subject(subject).await {
-                Ok(message) => return Ok(Some(Stored { seq: message.sequence, payload: message.payload })),
-                Err(error) => error,
-            };
-            match error.kind() {
-                LastRawMessageErrorKind::NoMessageFound => return Ok(None),
-                // no leader, no answer, no connection
-                LastRawMessageErrorKind::Other => {}
-                LastRawMessageErrorKind::JetStream(e) if e.code() >= 500 => {}
-                _ => return Err(failed("a message cannot be read")(error.into())),
-            }
-            tokio::time::sleep(PAUSE).await;
-        }
+        let message = ask(|| stream.get_last_raw_message_by_subject(subject)).await?;
+        Ok(message.map(|message| Stored { seq: message.sequence, payload: message.payload }))
     }
 }
 
-/// The server's own code of an error, where it gave one.
-fn code(error: &(dyn std::error::Error + 'static)) -> Option<ErrorCode> {
-    server_error(error).map(|error| error.error_code())
+/// Asks a stream's leader for a message until there is an answer; `None` when there is no such message.
+async fn ask<F>(question: impl Fn() -> F) -> Result<Option<StreamMessage>, EngineError>
+where
+    F: Future<Output = Result<StreamMessage, RawMessageError>>,
+{
+    loop {
+        let error = match question().await {
+            Ok(message) => return Ok(Some(message)),
+            Err(error) => error,
+        };
+        match error.kind() {
+            LastRawMessageErrorKind::NoMessageFound => return Ok(None),
+            // no leader, no answer, no connection
+            LastRawMessageErrorKind::Other => {}
+            LastRawMessageErrorKind::JetStream(refusal) if refusal.code() >= 500 => {}
+            _ => return Err(failed("a message cannot be read")(error.into())),
+        }
+        tokio::time::sleep(PAUSE).await;
+    }
 }
 
-/// Whether the server could not do it just now.
-fn is_passing(error: &(dyn std::error::Error + 'static)) -> bool {
-    server_error(error).is_none_or(|error| error.code() >= 500)
-}
-
+/// The server's own error behind an error, where it gave one.
 fn server_error<'a>(error: &'a (dyn std::error::Error + 'static)) -> Option<&'a jetstream::Error> {
     std::iter::successors(Some(error), |error| error.source()).find_map(|error| error.downcast_ref())
 }

@@ -39,7 +39,7 @@ impl Queue {
 
     /// Puts a job in the queue; one that is there moves to its end.
     pub(super) async fn push(&self, id: JobId) -> Result<(), EngineError> {
-        self.link.store(self.layout.work(id), Bytes::new(), Expect::Any).await.map(|_| ())
+        self.link.store(&self.layout.work, self.layout.work(id), Bytes::new(), Expect::Any).await.map(|_| ())
     }
 
     /// Up to `slots` ids that wait now, oldest first.
