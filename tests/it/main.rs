@@ -3,6 +3,7 @@
 mod app;
 mod certify;
 mod cli;
+mod cluster;
 mod conditional;
 mod contract;
 mod control;

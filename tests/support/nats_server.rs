@@ -1,4 +1,5 @@
-//! A real NATS server under test: an own process, an own port, an own folder; killed when the test ends.
+//! A real NATS server under test: an own process, an own port, an own folder; killed when the test ends. It runs with the
+//! configuration that is shipped.
 //!
 //! The program is `$SHRINKD_NATS_SERVER`, or `nats-server` on the path, or what `tests/support/cluster_tools.sh` installed. Where
 //! there is none the test says so and is skipped; with `CI=true` it fails, so that the gate cannot pass without it.
@@ -15,48 +16,48 @@ const START: Duration = Duration::from_secs(30);
 pub struct NatsServer {
     child: Child,
     program: PathBuf,
+    arguments: Vec<String>,
     folder: tempfile::TempDir,
     port: u16,
 }
 
 impl NatsServer {
-    /// Starts a server that syncs every message; `None` when there is no program and the test is to be skipped.
+    /// Starts a server; `None` when there is no program and the test is to be skipped.
     ///
     /// # Panics
     /// When it does not start, or when there is none and `CI` is `true`.
     pub fn start() -> Option<Self> {
-        let server = Self::begin(&program()?, free_port(), "");
+        let server = Self::begin(&program()?, Vec::new());
         server.wait();
         Some(server)
     }
 
-    /// Starts three servers that are one cluster, as [`start`](Self::start) does one.
+    /// Starts three servers that are one cluster, as [`start`](Self::start) does one. The name of the i-th is `n{i}`.
     #[allow(dead_code, reason = "not every test that includes this file needs it")]
     pub fn start_three() -> Option<[Self; 3]> {
         let program = program()?;
-        let routes = [(); 3].map(|()| free_port());
-        let urls = routes.map(|port| format!("\"nats://127.0.0.1:{port}\"")).join(", ");
-        let servers = [0, 1, 2].map(|i| {
-            let cluster = format!(
-                "server_name: n{i}\ncluster {{ name: test, listen: \"127.0.0.1:{}\", routes: [{urls}] }}\n",
-                routes[i]
-            );
-            Self::begin(&program, free_port(), &cluster)
+        let addresses = [(); 3].map(|()| format!("nats://127.0.0.1:{}", free_port()));
+        let servers = [0, 1, 2].map(|i: usize| {
+            let cluster = ["--cluster_name", "test", "--cluster", &addresses[i], "--routes", &addresses.join(",")];
+            let name = ["--name".to_owned(), format!("n{i}")];
+            Self::begin(&program, cluster.map(str::to_owned).into_iter().chain(name).collect())
         });
         servers.iter().for_each(Self::wait);
         Some(servers)
     }
 
-    fn begin(program: &Path, port: u16, more: &str) -> Self {
-        let folder = tempfile::tempdir().expect("folder");
-        let store = folder.path().join("store");
-        let config = format!(
-            "listen: \"127.0.0.1:{port}\"\nmax_payload: 8MB\n{more}\
-             jetstream {{ store_dir: \"{}\", sync_interval: always, max_mem: 256MB, max_file: 4GB }}\n",
-            store.display()
-        );
-        std::fs::write(folder.path().join("nats.conf"), config).expect("writes");
-        Self { child: spawn(program, folder.path()), program: program.to_owned(), folder, port }
+    fn begin(program: &Path, mut arguments: Vec<String>) -> Self {
+        let (folder, port) = (tempfile::tempdir().expect("folder"), free_port());
+        let path = |name: &str| folder.path().join(name).display().to_string();
+        let shipped = concat!(env!("CARGO_MANIFEST_DIR"), "/docker/nats.conf").to_owned();
+        let own = ["--config", &shipped, "--addr", "127.0.0.1", "--port", &port.to_string()].map(str::to_owned);
+        arguments.extend(own.into_iter().chain([
+            "--store_dir".to_owned(),
+            path("store"),
+            "--log".to_owned(),
+            path("log"),
+        ]));
+        Self { child: spawn(program, &arguments), program: program.to_owned(), arguments, folder, port }
     }
 
     /// Where it listens.
@@ -74,7 +75,7 @@ impl NatsServer {
     /// Starts it again on the same port with the same store.
     #[allow(dead_code, reason = "not every test that includes this file needs it")]
     pub fn restart(&mut self) {
-        self.child = spawn(&self.program, self.folder.path());
+        self.child = spawn(&self.program, &self.arguments);
         self.wait();
     }
 
@@ -87,7 +88,7 @@ impl NatsServer {
     }
 
     fn log(&self) -> String {
-        std::fs::read_to_string(self.folder.path().join("nats.log")).unwrap_or_default()
+        std::fs::read_to_string(self.folder.path().join("log")).unwrap_or_default()
     }
 }
 
@@ -122,9 +123,8 @@ fn program() -> Option<PathBuf> {
     found
 }
 
-fn spawn(program: &Path, folder: &Path) -> Child {
+fn spawn(program: &Path, arguments: &[String]) -> Child {
     let mut command = Command::new(program);
-    command.arg("-c").arg(folder.join("nats.conf")).arg("-l").arg(folder.join("nats.log"));
-    command.stdout(Stdio::null()).stderr(Stdio::null());
+    command.args(arguments).stdout(Stdio::null()).stderr(Stdio::null());
     command.spawn().unwrap_or_else(|e| panic!("{} does not start: {e}", program.display()))
 }
