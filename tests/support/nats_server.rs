@@ -12,6 +12,9 @@ use std::time::{Duration, Instant};
 /// Longer than a server takes to start on the slowest machine.
 const START: Duration = Duration::from_secs(30);
 
+/// The configuration for production, of which only the folder is changed.
+const SHIPPED: &str = include_str!("../../docker/nats.conf");
+
 /// A running server.
 pub struct NatsServer {
     child: Child,
@@ -49,14 +52,11 @@ impl NatsServer {
     fn begin(program: &Path, mut arguments: Vec<String>) -> Self {
         let (folder, port) = (tempfile::tempdir().expect("folder"), free_port());
         let path = |name: &str| folder.path().join(name).display().to_string();
-        let shipped = concat!(env!("CARGO_MANIFEST_DIR"), "/docker/nats.conf").to_owned();
-        let own = ["--config", &shipped, "--addr", "127.0.0.1", "--port", &port.to_string()].map(str::to_owned);
-        arguments.extend(own.into_iter().chain([
-            "--store_dir".to_owned(),
-            path("store"),
-            "--log".to_owned(),
-            path("log"),
-        ]));
+        let config = SHIPPED.replace("/data/nats", &path("store"));
+        assert_ne!(config, SHIPPED, "the store is not where it was");
+        std::fs::write(path("nats.conf"), config).expect("writes");
+        let own = ["--config", &path("nats.conf"), "--addr", "127.0.0.1", "--port", &port.to_string()];
+        arguments.extend(own.into_iter().chain(["--log", &path("log")]).map(str::to_owned));
         Self { child: spawn(program, &arguments), program: program.to_owned(), arguments, folder, port }
     }
 
