@@ -6,7 +6,7 @@
 
 use super::layout::Layout;
 use super::ledger::Ledger;
-use super::link::failed;
+use super::link::{CALL, failed};
 use super::record::Entry;
 use crate::engine::EngineError;
 use crate::job::{Event, JobId};
@@ -49,9 +49,14 @@ impl Feed {
     pub(super) async fn start(ledger: Arc<Ledger>) -> Result<Self, EngineError> {
         let (sender, mut position) = watch::channel(Position::default());
         let task = tokio::spawn(run(ledger, sender));
-        let caught_up = position.wait_for(|position| position.caught_up).await.map(|_| ());
-        caught_up.map_err(|_| EngineError::Stopped)?;
-        Ok(Self { position, task })
+        let feed = Self { position: position.clone(), task };
+        while !position.borrow_and_update().caught_up {
+            let moved = tokio::time::timeout(CALL, position.changed()).await;
+            moved
+                .map_err(|_| EngineError::Store("the records do not come".to_owned()))?
+                .map_err(|_| EngineError::Stopped)?;
+        }
+        Ok(feed)
     }
 
     /// Whether every entry up to this one is in the projection, after a wait of at most `patience`.

@@ -22,23 +22,23 @@ const EVENTS_AT_HAND: Duration = Duration::from_secs(60 * 60);
 const UNDER_WAY: Duration = Duration::from_secs(24 * 60 * 60);
 
 /// Tidies up. What another node removes meanwhile is no error.
-pub(super) async fn tidy(ledger: &Ledger) -> Result<(), EngineError> {
-    ledger.projection.drop_events_before(ago(EVENTS_AT_HAND)).await?;
-    remove_tombstones(ledger).await?;
-    thin_ended_jobs(ledger).await?;
-    remove_orphaned_requests(ledger).await
+pub(super) async fn tidy(ledger: &Ledger, now: Timestamp) -> Result<(), EngineError> {
+    ledger.projection.drop_events_before(before(now, EVENTS_AT_HAND)).await?;
+    remove_tombstones(ledger, before(now, TOMBSTONES)).await?;
+    thin_ended_jobs(ledger, before(now, EVENTS)).await?;
+    remove_orphaned_requests(ledger, before(now, UNDER_WAY)).await
 }
 
-async fn remove_tombstones(ledger: &Ledger) -> Result<(), EngineError> {
-    let forgotten = ledger.projection.forgotten_before(ago(TOMBSTONES)).await?;
+async fn remove_tombstones(ledger: &Ledger, then: Timestamp) -> Result<(), EngineError> {
+    let forgotten = ledger.projection.forgotten_before(then).await?;
     for id in &forgotten {
         purge(&ledger.layout.jobs, ledger.layout.job(*id), 0).await?;
     }
     ledger.projection.drop_forgotten(forgotten).await
 }
 
-async fn thin_ended_jobs(ledger: &Ledger) -> Result<(), EngineError> {
-    let ended: HashSet<JobId> = ledger.projection.ended_before(ago(EVENTS)).await?.into_iter().collect();
+async fn thin_ended_jobs(ledger: &Ledger, then: Timestamp) -> Result<(), EngineError> {
+    let ended: HashSet<JobId> = ledger.projection.ended_before(then).await?.into_iter().collect();
     if ended.is_empty() {
         return Ok(());
     }
@@ -50,10 +50,10 @@ async fn thin_ended_jobs(ledger: &Ledger) -> Result<(), EngineError> {
     Ok(())
 }
 
-async fn remove_orphaned_requests(ledger: &Ledger) -> Result<(), EngineError> {
+async fn remove_orphaned_requests(ledger: &Ledger, then: Timestamp) -> Result<(), EngineError> {
     for (subject, _) in subjects(&ledger.layout.specs, ledger.layout.every_spec()).await? {
         let Some(id) = Layout::id_of(&subject) else { continue };
-        let is_old = made_at(id).is_some_and(|made| made < ago(UNDER_WAY));
+        let is_old = made_at(id).is_some_and(|made| made < then);
         if !is_old || ledger.projection.knows(id).await? {
             continue;
         }
@@ -70,8 +70,7 @@ fn made_at(id: JobId) -> Option<Timestamp> {
     Timestamp::new(seconds as i64, nanoseconds as i32).ok()
 }
 
-fn ago(time: Duration) -> Timestamp {
-    let now = Timestamp::now();
+fn before(now: Timestamp, time: Duration) -> Timestamp {
     now.checked_sub(SignedDuration::try_from(time).unwrap_or(SignedDuration::ZERO)).unwrap_or(now)
 }
 
@@ -93,7 +92,7 @@ mod tests {
 
     #[test]
     fn a_job_is_as_old_as_its_name_says() {
-        let made = made_at(JobId::new()).expect("a time");
-        assert!(made > ago(Duration::from_secs(60)) && made < ago(Duration::ZERO) + SignedDuration::from_secs(60));
+        let (earliest, made) = (super::super::record::now(), made_at(JobId::new()).expect("a time"));
+        assert!(made >= earliest && made <= Timestamp::now());
     }
 }

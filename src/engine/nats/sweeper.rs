@@ -10,6 +10,7 @@ use crate::engine::EngineError;
 use crate::engine::nats::link::{failed, patiently};
 use crate::job::{JobId, State};
 use futures::TryStreamExt;
+use jiff::Timestamp;
 use std::collections::HashSet;
 use std::sync::Weak;
 use std::time::Duration;
@@ -57,7 +58,7 @@ pub(super) async fn run(node: Weak<Node>) {
         }
         if Instant::now() >= next_housekeeping {
             next_housekeeping = Instant::now() + jittered(HOUSEKEEPING);
-            if let Err(error) = housekeeping::tidy(&node.ledger).await {
+            if let Err(error) = housekeeping::tidy(&node.ledger, Timestamp::now()).await {
                 warn!(%error, "the housekeeping was not finished");
             }
         }

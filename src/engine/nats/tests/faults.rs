@@ -65,6 +65,20 @@ async fn a_submit_that_died_after_its_key_is_finished_by_its_repetition() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_job_whose_request_cannot_be_read_fails_and_holds_nobody_up() {
+    let Some(cluster) = Cluster::start() else { return };
+    let a = cluster.node(CALM).await;
+    let new = conformance::new_job();
+    let draft = record::Draft::accepted(&new, now());
+    a.node.ledger.write(new.id, draft, Expect::Nothing).await.expect("stores").expect("is new");
+    a.node.enqueue(new.id).await;
+    let next = submit(&a).await;
+    assert_eq!(claim(&a).await.id, next);
+    let failed = job(&a, new.id).await;
+    assert_eq!((failed.state, failed.problem.map(|p| p.code).as_deref()), (State::Failed, Some("internal")));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_job_claimed_for_a_worker_that_went_away_is_given_back() {
     let Some(cluster) = Cluster::start() else { return };
     let a = cluster.node(CALM).await;

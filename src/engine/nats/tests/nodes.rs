@@ -196,3 +196,54 @@ async fn a_key_outlives_its_job() {
     assert_eq!(b.submit(keyed()).await.expect("answers"), Submitted::Replayed(job.clone()));
     assert_eq!(b.recall(key).await.expect("answers"), Some(Submitted::Replayed(job)));
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn services_with_different_prefixes_do_not_meet() {
+    let Some(cluster) = Cluster::start() else { return };
+    let a = cluster.node(CALM).await;
+    let address = format!("{}?prefix=OTHER", cluster.server.url()).parse().expect("an address");
+    let other = NatsEngine::open(&address, cluster.folder.path(), CALM).await.expect("opens");
+    let id = submit(&a).await;
+    assert_eq!(other.get(id).await.expect("reads"), None);
+    assert!(other.claim("b", 1, Duration::from_millis(200)).await.expect("claims").is_empty());
+    assert!(other.list(ListQuery { limit: 1, ..ListQuery::default() }).await.expect("lists").jobs.is_empty());
+    assert_eq!(claim(&a).await.id, id);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_nobody_asks_for_any_more_is_tidied_up_and_nothing_else() {
+    let Some(cluster) = Cluster::start() else { return };
+    let a = cluster.node(CALM).await;
+    let ledger = &a.node.ledger;
+    let (open, ended, forgotten) = (submit(&a).await, submit(&a).await, submit(&a).await);
+    let orphan = JobId::new();
+    ledger
+        .link
+        .store(&ledger.layout.specs, ledger.layout.spec(orphan), "{}".into(), link::Expect::Any)
+        .await
+        .expect("stores");
+    for id in [ended, forgotten] {
+        a.request_cancel(id).await.expect("cancels");
+    }
+    a.forget(forgotten).await.expect("forgets");
+    let before = all_events(&a, ended).await;
+    assert_eq!(before.len(), 3, "queued, canceled, done");
+
+    let later = |days: i64| jiff::Timestamp::now() + jiff::SignedDuration::from_hours(24 * days + 1);
+    let entries = async |id| {
+        let mut info =
+            ledger.layout.jobs.info_builder().subjects(ledger.layout.job(id)).fetch().await.expect("is there");
+        info.next().await.map_or(0, |found| found.expect("reads").1)
+    };
+    housekeeping::tidy(ledger, later(0)).await.expect("tidies");
+    assert_eq!((entries(open).await, entries(ended).await, entries(forgotten).await), (1, 2, 1), "it is too early");
+    housekeeping::tidy(ledger, later(1)).await.expect("tidies");
+    assert_eq!((entries(open).await, entries(ended).await, entries(forgotten).await), (1, 1, 1));
+    housekeeping::tidy(ledger, later(2)).await.expect("tidies");
+    assert_eq!((entries(open).await, entries(ended).await, entries(forgotten).await), (1, 1, 0));
+    assert_eq!(ledger.request(orphan).await.expect("reads"), None);
+    assert!(a.spec(open).await.expect("reads").is_some() && a.spec(ended).await.expect("reads").is_some());
+    let after = all_events(&a, ended).await;
+    assert_eq!(after.iter().map(|e| e.kind).collect::<Vec<_>>(), [EventKind::Snapshot, EventKind::Done]);
+    assert_eq!(after.last(), before.last());
+}
