@@ -11,6 +11,7 @@ pub mod first_job;
 pub mod fit;
 pub mod healthcheck;
 mod interrupt;
+mod open_engine;
 mod options;
 pub mod sensitivity;
 pub mod serve;
@@ -84,6 +85,9 @@ pub struct ServeArgs {
     /// Folder of the database and the blobs [default: ./shrinkd-data]
     #[arg(long, value_name = "DIR")]
     pub data: Option<PathBuf>,
+    /// Where jobs are kept: sqlite, or nats://HOST:PORT for a cluster [default: sqlite]
+    #[arg(long, value_name = "URL")]
+    pub engine: Option<String>,
     /// Where inputs and outputs lie: folder, or s3://BUCKET/PREFIX [default: folder]
     #[arg(long, value_name = "URL")]
     pub blobs: Option<String>,

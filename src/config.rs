@@ -3,6 +3,7 @@
 //! In variables a level is two underscores: `SHRINKD_WORKER__SLOTS=4`. Unknown names are refused, in the file and in the
 //! environment. The defaults need nothing: one folder, loopback only.
 
+use crate::engine::nats::{Address, InvalidAddress};
 use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
 use jiff::Timestamp;
@@ -18,6 +19,9 @@ pub struct Config {
     pub listen: SocketAddr,
     /// Folder of the database and the blobs (`SHRINKD_DATA_DIR`), made when it is not there.
     pub data_dir: PathBuf,
+    /// Where jobs are kept (`SHRINKD_ENGINE`): `sqlite`, in the folder and for one process; or the
+    /// [address](crate::engine::nats::Address) of NATS servers, for any number of nodes. It may hold a password.
+    pub engine: String,
     /// Origins whose pages may call the service (`SHRINKD_CORS_ORIGINS`, a list); none.
     pub cors_origins: Vec<String>,
     /// Where inputs and outputs lie (`SHRINKD_BLOBS`): `folder`, in the folder above; or `s3://BUCKET/PREFIX`, with what the `AWS_*`
@@ -120,6 +124,7 @@ impl Default for Config {
         Self {
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
             data_dir: PathBuf::from("./shrinkd-data"),
+            engine: SQLITE.to_owned(),
             cors_origins: Vec::new(),
             blobs: FOLDER.to_owned(),
             download_link_s: 0,
@@ -132,6 +137,8 @@ impl Default for Config {
     }
 }
 
+/// The embedded engine's name.
+pub const SQLITE: &str = "sqlite";
 /// Blobs in the node's own folder.
 pub const FOLDER: &str = "folder";
 
@@ -158,12 +165,19 @@ impl Config {
             (config.worker.max_losses == 0, "worker.max_losses must be at least 1"),
             (config.retention.every_s == 0, "retention.every_s must be at least 1"),
             (config.retention.inputs_s < 3600, "retention.inputs_s must be at least 3600"),
+            (
+                config.role != Role::All && config.engine == SQLITE,
+                "role api or worker needs an engine that other nodes reach: engine = \"nats://...\"",
+            ),
             (config.limits.body_bytes == 0 || config.limits.input_bytes == 0, "limits must be at least 1"),
         ];
-        match wrong.iter().find(|(is_wrong, _)| *is_wrong) {
-            Some((_, why)) => Err(ConfigError::Impossible(why)),
-            None => Ok(config),
+        if let Some((_, why)) = wrong.iter().find(|(is_wrong, _)| *is_wrong) {
+            return Err(ConfigError::Impossible(why));
         }
+        if config.engine != SQLITE {
+            config.engine.parse::<Address>()?;
+        }
+        Ok(config)
     }
 }
 
@@ -176,6 +190,9 @@ pub enum ConfigError {
     /// It asks for what cannot work.
     #[error("configuration: {0}")]
     Impossible(&'static str),
+    /// The engine is neither `sqlite` nor an address.
+    #[error("configuration: engine: {0}, or sqlite")]
+    Engine(#[from] InvalidAddress),
 }
 
 #[cfg(test)]
@@ -203,9 +220,12 @@ mod tests {
     fn unknown_names_and_impossible_values_are_refused() {
         let folder = tempfile::tempdir().expect("folder");
         let file = folder.path().join("shrinkd.toml");
-        for (text, named) in
-            [("lisen = \"x\"", "lisen"), ("[worker]\nslots = 0", "slots"), ("[log]\nformat = \"xml\"", "xml")]
-        {
+        for (text, named) in [
+            ("lisen = \"x\"", "lisen"),
+            ("[worker]\nslots = 0", "slots"),
+            ("[log]\nformat = \"xml\"", "xml"),
+            ("engine = \"http://a\"", "engine"),
+        ] {
             std::fs::write(&file, text).expect("writes");
             let error =
                 Config::load(Some(&file), figment::util::map!["log" => figment::util::map!["filter" => "info"]]);

@@ -7,6 +7,7 @@
 //! old events are kept (a reader that comes too late gets a fresh snapshot).
 
 pub mod conformance;
+pub mod nats;
 pub mod sqlite;
 
 use crate::job::{Event, EventKind, Failure, Job, JobId, JobSpec, Output, ProgressView, State};
@@ -15,6 +16,22 @@ use jiff::Timestamp;
 use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
+
+/// How leases and attempts are judged.
+#[derive(Clone, Copy, Debug)]
+pub struct Terms {
+    /// How long a claim lasts without a renewal.
+    pub lease: Duration,
+    /// Lost attempts after which a job is failed.
+    pub max_losses: u32,
+}
+
+impl Default for Terms {
+    /// 30 s (three heartbeats of 10 s), and five losses: a job that kills its worker five times is poison.
+    fn default() -> Self {
+        Self { lease: Duration::from_secs(30), max_losses: 5 }
+    }
+}
 
 /// A key that makes a submit repeatable, and what it was used for.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -1,10 +1,9 @@
 //! `shrinkd serve`: puts the rooms together and runs them until a signal comes.
 
+use super::open_engine::open_engine;
 use super::{BAD_USAGE, FAILED, ServeArgs, fail, first_job};
 use crate::blobs::Blobs;
-use crate::config::{Config, FOLDER, Role};
-use crate::engine::Engine;
-use crate::engine::sqlite::{SqliteEngine, Terms};
+use crate::config::{Config, FOLDER, Role, SQLITE};
 use crate::http::{self, App};
 use crate::job::collector;
 use crate::job::worker::Worker;
@@ -29,6 +28,8 @@ struct Flags<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
     data_dir: Option<&'a std::path::Path>,
     #[serde(skip_serializing_if = "Option::is_none")]
+    engine: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
     blobs: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     role: Option<Role>,
@@ -36,8 +37,13 @@ struct Flags<'a> {
 
 /// Runs the service until SIGTERM or SIGINT.
 pub fn run(args: &ServeArgs) -> ExitCode {
-    let flags =
-        Flags { listen: args.listen, data_dir: args.data.as_deref(), blobs: args.blobs.as_deref(), role: args.role };
+    let flags = Flags {
+        listen: args.listen,
+        data_dir: args.data.as_deref(),
+        engine: args.engine.as_deref(),
+        blobs: args.blobs.as_deref(),
+        role: args.role,
+    };
     let config = match Config::load(args.config.as_deref(), flags) {
         Ok(config) => config,
         Err(error) => return fail(BAD_USAGE, &error),
@@ -61,6 +67,9 @@ pub fn run(args: &ServeArgs) -> ExitCode {
 /// Opens the blob store, and warns of what will not work with it.
 async fn open_blobs(config: &Config) -> Result<Blobs, Box<dyn std::error::Error>> {
     if config.blobs == FOLDER {
+        if config.engine != SQLITE {
+            tracing::warn!("blobs are in this node's folder: other nodes of the cluster do not see them unless they share it");
+        }
         if config.download_link_s > 0 {
             tracing::warn!("download_link_s does nothing: blobs in a folder have no links");
         }
@@ -79,8 +88,7 @@ async fn open_blobs(config: &Config) -> Result<Blobs, Box<dyn std::error::Error>
 }
 
 async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std::error::Error>> {
-    let terms = Terms { lease: Duration::from_secs(config.worker.lease_s), max_losses: config.worker.max_losses };
-    let engine: Arc<dyn Engine> = Arc::new(SqliteEngine::open(&config.data_dir, terms)?);
+    let engine = open_engine(&config).await?;
     let blobs = open_blobs(&config).await?;
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(config.worker.threads)

@@ -4,54 +4,37 @@
 //! begins is committed together, so that many submits share one sync. Readers have connections of their own and never
 //! wait for the writer. A lock file keeps a second process out, so every claim found at the start belongs to a dead worker.
 
-mod records;
-mod schema;
-mod writer;
+mod readers;
+pub(super) mod records;
+pub(super) mod schema;
+pub(super) mod writer;
+
+pub(super) use readers::Readers;
 
 use super::{
     Changes, Claim, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Page,
-    Renewal, Submitted, Update,
+    Renewal, Submitted, Terms, Update,
 };
 use crate::job::{Failure, Job, JobId, JobSpec, State};
 use jiff::Timestamp;
 use records::{Change, Ctx};
 use rusqlite::{Connection, OptionalExtension, params};
 use std::fs::{File, TryLockError};
-use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex};
+use std::path::Path;
+use std::sync::Arc;
 use std::time::Duration;
-use tokio::sync::{Notify, Semaphore};
+use tokio::sync::Notify;
 use writer::{Hub, Writer};
 
 /// How long an idempotency key is kept.
 const KEY_LIFETIME_MS: i64 = 24 * 60 * 60 * 1000;
-/// Connections that read at once: more than the disk answers at once, few enough for their page caches.
-const READERS: usize = 8;
 /// How often a worker that waits for a job looks for leases that ran out.
 const SWEEP: Duration = Duration::from_secs(1);
-
-/// How leases and attempts are judged.
-#[derive(Clone, Copy, Debug)]
-pub struct Terms {
-    /// How long a claim lasts without a renewal.
-    pub lease: Duration,
-    /// Lost attempts after which a job is failed.
-    pub max_losses: u32,
-}
-
-impl Default for Terms {
-    /// 30 s (three heartbeats of 10 s), and five losses: a job that kills its worker five times is poison.
-    fn default() -> Self {
-        Self { lease: Duration::from_secs(30), max_losses: 5 }
-    }
-}
 
 /// The embedded engine.
 pub struct SqliteEngine {
     writer: Writer,
-    readers: Arc<Mutex<Vec<Connection>>>,
-    reading: Arc<Semaphore>,
-    path: PathBuf,
+    readers: Readers,
     hub: Arc<Hub>,
     queued: Arc<Notify>,
     terms: Terms,
@@ -81,9 +64,9 @@ impl SqliteEngine {
             tracing::warn!(jobs = lost, "jobs of an earlier process are taken up again");
         }
         let writer = Writer::start(connection, hub.clone())?;
-        let (readers, reading) = (Arc::default(), Arc::new(Semaphore::new(READERS)));
+        let readers = Readers::new(path, connect);
         let queued = Arc::new(Notify::new());
-        Ok(Self { writer, readers, reading, path, hub, queued, terms, _lock: lock })
+        Ok(Self { writer, readers, hub, queued, terms, _lock: lock })
     }
 
     async fn write<T: Send + 'static>(
@@ -97,21 +80,7 @@ impl SqliteEngine {
         &self,
         work: impl FnOnce(&Connection) -> rusqlite::Result<T> + Send + 'static,
     ) -> Result<T, EngineError> {
-        let (readers, path) = (self.readers.clone(), self.path.clone());
-        let turn = self.reading.clone().acquire_owned().await.map_err(|_| EngineError::Stopped)?;
-        let read = tokio::task::spawn_blocking(move || {
-            let _turn = turn;
-            let pooled = readers.lock().unwrap_or_else(|e| e.into_inner()).pop();
-            let mut connection = match pooled {
-                Some(connection) => connection,
-                None => connect(&path)?,
-            };
-            // one transaction, so that everything read belongs together; it ends when it is dropped
-            let result = connection.transaction().and_then(|tx| work(&tx))?;
-            readers.lock().unwrap_or_else(|e| e.into_inner()).push(connection);
-            Ok(result)
-        });
-        read.await.map_err(|e| EngineError::Store(e.to_string()))?
+        self.readers.run(work).await
     }
 }
 

@@ -90,8 +90,8 @@ async fn remove(engine: &dyn Engine, blobs: &Blobs, retention: &Retention, id: B
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::engine::sqlite::{SqliteEngine, Terms};
-    use crate::engine::{NewJob, Outcome};
+    use crate::engine::sqlite::SqliteEngine;
+    use crate::engine::{NewJob, Outcome, Terms};
     use crate::job::{JobId, JobSpec, Output};
     use bytes::Bytes;
     use serde_json::json;

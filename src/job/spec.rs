@@ -195,6 +195,9 @@ pub enum Work {
     Sensitivity(Box<Sensing>),
 }
 
+/// What the names of inputs begin with among those of a job's blobs.
+pub const INPUT: &str = "input:";
+
 impl Work {
     /// The blobs that it works on: of a surface those of its field, its weight and its warm start, where it has them; the meshes
     /// of a fit; the network, the surface and the gradient of a sensitivity.
@@ -208,6 +211,11 @@ impl Work {
             Self::Fit(fitting) => fitting.meshes.clone(),
             Self::Sensitivity(work) => work.field.input.into_iter().chain([work.surface, work.gradient]).collect(),
         }
+    }
+
+    /// All of its blobs, by names that no output has and that begin with [`INPUT`]: they are kept while the job is remembered.
+    pub fn inputs(&self) -> Vec<(String, BlobId)> {
+        self.blobs().into_iter().enumerate().map(|(i, blob)| (format!("{INPUT}{i}"), blob)).collect()
     }
 
     /// Those of its blobs that are no inputs, and must be kept for it as its outputs are; by names that no output has.

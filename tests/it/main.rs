@@ -4,6 +4,7 @@ mod app;
 mod bucket;
 mod certify;
 mod cli;
+mod cluster;
 mod conditional;
 mod contract;
 mod control;

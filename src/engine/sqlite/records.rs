@@ -12,10 +12,10 @@ use serde_json::json;
 use std::sync::Arc;
 
 /// Events kept per job. A reader that falls further behind starts over from a snapshot.
-const KEPT_EVENTS: u64 = 512;
+pub(in crate::engine) const KEPT_EVENTS: u64 = 512;
 
 /// A transaction of the writer.
-pub(super) struct Ctx<'a> {
+pub(in crate::engine) struct Ctx<'a> {
     /// The connection, inside its transaction.
     pub connection: &'a Connection,
     /// Milliseconds since the epoch.
@@ -39,7 +39,7 @@ impl Change {
 }
 
 /// A stored value that cannot be read.
-pub(super) fn corrupt(error: impl std::error::Error + Send + Sync + 'static) -> rusqlite::Error {
+pub(in crate::engine) fn corrupt(error: impl std::error::Error + Send + Sync + 'static) -> rusqlite::Error {
     rusqlite::Error::FromSqlConversionFailure(0, rusqlite::types::Type::Text, Box::new(error))
 }
 
@@ -47,7 +47,7 @@ pub(super) fn from_json<T: DeserializeOwned>(text: &str) -> rusqlite::Result<T> 
     serde_json::from_str(text).map_err(corrupt)
 }
 
-pub(super) fn to_json(value: &(impl Serialize + ?Sized)) -> rusqlite::Result<String> {
+pub(in crate::engine) fn to_json(value: &(impl Serialize + ?Sized)) -> rusqlite::Result<String> {
     serde_json::to_string(value).map_err(|e| rusqlite::Error::ToSqlConversionFailure(Box::new(e)))
 }
 
@@ -124,26 +124,15 @@ pub(super) fn insert(ctx: &mut Ctx<'_>, new: &NewJob) -> rusqlite::Result<()> {
     for (name, blob) in spec.work.held() {
         name_blob(ctx.connection, new.id, name, &blob.hex())?;
     }
-    name_inputs(ctx.connection, new.id)?;
+    for (name, blob) in spec.work.inputs() {
+        name_blob(ctx.connection, new.id, &name, &blob.hex())?;
+    }
     for (name, value) in &spec.labels {
         let label = "INSERT INTO labels (job, name, value) VALUES (?1, ?2, ?3)";
         ctx.connection.execute(label, params![id, name, value])?;
     }
     tell_state(ctx, new.id)
 }
-
-/// Notes the blobs that a job's request names, whatever member of it does, so that they are kept while the job is.
-fn name_inputs(connection: &Connection, job: JobId) -> rusqlite::Result<()> {
-    let named = format!("{NAME_INPUTS} WHERE jobs.id = ?1 AND {IS_BLOB}");
-    connection.prepare_cached(&named)?.execute([job.to_string()]).map(|_| ())
-}
-
-/// Notes the inputs of jobs; to be followed by which, and by [`IS_BLOB`].
-pub(super) const NAME_INPUTS: &str = "INSERT OR IGNORE INTO outputs (job, name, sha256)
-    SELECT jobs.id, 'input:' || member.fullkey, substr(member.value, 8) FROM jobs, json_tree(jobs.spec) AS member";
-/// Whether a member of a request is the name of a blob.
-pub(super) const IS_BLOB: &str =
-    "member.type = 'text' AND length(member.value) = 71 AND substr(member.value, 1, 7) = 'sha256:'";
 
 /// Notes that a job names a blob, so that the blob is kept while the job is.
 fn name_blob(connection: &Connection, job: JobId, name: &str, sha256: &str) -> rusqlite::Result<()> {
@@ -152,7 +141,7 @@ fn name_blob(connection: &Connection, job: JobId, name: &str, sha256: &str) -> r
 }
 
 /// Those of these blobs that no job names; jobs that ended before `expired` do not count.
-pub(super) fn unnamed(
+pub(in crate::engine) fn unnamed(
     connection: &Connection,
     mut blobs: Vec<String>,
     expired: Option<Timestamp>,
@@ -177,7 +166,7 @@ pub(super) fn named_blobs(connection: &Connection, job: JobId) -> rusqlite::Resu
     named.query_map([job.to_string()], |row| row.get(0))?.collect()
 }
 
-pub(super) fn list(connection: &Connection, query: &ListQuery) -> rusqlite::Result<Page> {
+pub(in crate::engine) fn list(connection: &Connection, query: &ListQuery) -> rusqlite::Result<Page> {
     let mut wanted = vec!["1".to_owned()];
     let mut values: Vec<Sql> = Vec::new();
     let mut bind = |value: Sql| -> String {
@@ -275,7 +264,7 @@ fn append(ctx: &mut Ctx<'_>, id: JobId, kind: EventKind, data: serde_json::Value
     Ok(())
 }
 
-pub(super) fn events_after(
+pub(in crate::engine) fn events_after(
     connection: &Connection,
     id: JobId,
     after: u64,

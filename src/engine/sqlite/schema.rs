@@ -1,6 +1,5 @@
 //! Tables of the embedded engine, and how an older file becomes a newer one.
 
-use super::records::{IS_BLOB, NAME_INPUTS};
 use crate::engine::EngineError;
 use rusqlite::Connection;
 
@@ -62,15 +61,16 @@ const MIGRATIONS: [&str; 3] = [
     ALTER TABLE jobs ADD COLUMN kind TEXT NOT NULL DEFAULT 'shrink';
     ALTER TABLE jobs RENAME COLUMN shrink TO settings;
 ",
-    // the inputs of the jobs that are there are noted, which later jobs do as they come
-    "",
+    // the blobs that the requests of jobs name, whatever member of them does; a job that comes later is noted with its own
+    "
+    INSERT INTO outputs (job, name, sha256)
+        SELECT jobs.id, 'input:' || member.fullkey, substr(member.value, 8) FROM jobs, json_tree(jobs.spec) AS member
+        WHERE member.type = 'text' AND length(member.value) = 71 AND substr(member.value, 1, 7) = 'sha256:';
+",
 ];
 
-/// The step after which the inputs of all jobs are in the table of what they name.
-const NOTES_INPUTS: usize = 2;
-
 /// Brings the file to this version.
-pub(super) fn migrate(connection: &mut Connection) -> Result<(), EngineError> {
+pub(in crate::engine) fn migrate(connection: &mut Connection) -> Result<(), EngineError> {
     let version: usize = connection.query_row("PRAGMA user_version", [], |row| row.get(0))?;
     if version > MIGRATIONS.len() {
         return Err(EngineError::Store(format!("the database is of version {version}, newer than this program")));
@@ -78,9 +78,6 @@ pub(super) fn migrate(connection: &mut Connection) -> Result<(), EngineError> {
     for (i, step) in MIGRATIONS.iter().enumerate().skip(version) {
         let tx = connection.transaction()?;
         tx.execute_batch(step)?;
-        if i == NOTES_INPUTS {
-            tx.execute(&format!("{NAME_INPUTS} WHERE {IS_BLOB}"), [])?;
-        }
         tx.pragma_update(None, "user_version", i + 1)?;
         tx.commit()?;
     }

@@ -22,7 +22,7 @@ const FEWEST_TO_PRUNE: usize = 256;
 
 /// Who listens to which job.
 #[derive(Default)]
-pub(super) struct Hub(Mutex<Listeners>);
+pub(in crate::engine) struct Hub(Mutex<Listeners>);
 
 #[derive(Default)]
 struct Listeners {
@@ -32,7 +32,7 @@ struct Listeners {
 }
 
 impl Hub {
-    pub(super) fn subscribe(&self, id: JobId) -> broadcast::Receiver<Arc<Event>> {
+    pub(in crate::engine) fn subscribe(&self, id: JobId) -> broadcast::Receiver<Arc<Event>> {
         let mut hub = self.0.lock().unwrap_or_else(|e| e.into_inner());
         if hub.senders.len() >= hub.prune_at {
             hub.senders.retain(|_, sender| sender.receiver_count() > 0);
@@ -57,13 +57,13 @@ type Piece = Box<dyn FnOnce(&mut Ctx<'_>) -> Reply + Send>;
 type Reply = Box<dyn FnOnce(Result<(), String>) + Send>;
 
 /// Handle on the writing thread, which ends when the handle is dropped.
-pub(super) struct Writer {
+pub(in crate::engine) struct Writer {
     pieces: Option<SyncSender<Piece>>,
     thread: Option<std::thread::JoinHandle<()>>,
 }
 
 impl Writer {
-    pub(super) fn start(connection: Connection, hub: Arc<Hub>) -> Result<Self, EngineError> {
+    pub(in crate::engine) fn start(connection: Connection, hub: Arc<Hub>) -> Result<Self, EngineError> {
         let (pieces, queue) = sync_channel(BACKLOG);
         let thread = std::thread::Builder::new()
             .name("engine-writer".to_owned())
@@ -73,7 +73,7 @@ impl Writer {
     }
 
     /// Runs `work` in a transaction and returns when it is on the disk.
-    pub(super) async fn run<T: Send + 'static>(
+    pub(in crate::engine) async fn run<T: Send + 'static>(
         &self,
         work: impl FnOnce(&mut Ctx<'_>) -> rusqlite::Result<T> + Send + 'static,
     ) -> Result<T, EngineError> {

@@ -1,0 +1,345 @@
+//! The cluster engine: NATS JetStream, for any number of nodes.
+//!
+//! Every node has one connection, one consumer that brings it every job's changes, and a [projection](projection) of them
+//! that it lists from. The truth is the [record](record) of a job in its stream, and every change of it is a compare-and-set
+//! that says from which version it was made; so it does not matter which node, worker or sweeper is late, frozen or cut off.
+//!
+//! | promise | kept by |
+//! |---|---|
+//! | accepted jobs survive | the record is stored by a majority of the servers before `submit` returns; they must sync (`docker/nats.conf`) |
+//! | one worker at a time | a claim is a compare-and-set from `queued` to `running` under the next attempt |
+//! | only the newest attempt counts | renewing and finishing look at the attempt in the version that they replace |
+//! | lost workers are found | every node [watches heartbeats](leases) by its own clock |
+//! | events have no gap | they are [stored with the record](record), in one message |
+//! | one key, one job | a [key](keys) names its job, and whoever finds it makes that job |
+//!
+//! Not guaranteed beyond what the [room](super) says: a list on one node shows what was submitted on another only once its
+//! feed has brought it, usually within milliseconds; and a job that comes back to the queue waits behind those that are there.
+//! Do not use it for a single machine: the embedded engine needs no servers and is faster.
+
+mod address;
+mod claims;
+mod feed;
+mod housekeeping;
+mod keys;
+mod layout;
+mod leases;
+mod ledger;
+mod link;
+mod projection;
+mod queue;
+mod record;
+mod sweeper;
+#[cfg(test)]
+mod tests;
+
+pub use address::{Address, InvalidAddress, SCHEMES};
+
+use super::{
+    Changes, Claim, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Page,
+    Renewal, Submitted, Terms, Update,
+};
+use crate::job::{Job, JobId, JobSpec, State};
+use feed::Feed;
+use layout::Layout;
+use ledger::{Found, Ledger, Step, Version};
+use link::{Link, failed, patiently};
+use projection::Projection;
+use queue::Queue;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::task::JoinHandle;
+
+/// How long `health` waits for the servers.
+const HEALTH: Duration = Duration::from_secs(2);
+/// How often a running job looks at its claim by itself; news wake it at once.
+const LOOK: Duration = Duration::from_secs(1);
+/// How long a call waits for the queue once the record is stored.
+const ENQUEUE: Duration = Duration::from_secs(2);
+/// How long forgetting waits for what other nodes stored before it; after that the blobs are kept.
+const FORGET: Duration = Duration::from_secs(2);
+/// Bytes of news that are stored together at most: well below the messages that servers take by default.
+const NEWS_BYTES: usize = 256 << 10;
+
+/// One node of the cluster.
+pub struct NatsEngine {
+    node: Arc<Node>,
+    sweeper: JoinHandle<()>,
+}
+
+/// What the engine's tasks share.
+struct Node {
+    ledger: Arc<Ledger>,
+    queue: Queue,
+    feed: Feed,
+    terms: Terms,
+}
+
+impl NatsEngine {
+    /// Connects to the servers, makes the streams that are not there, and reads every record into a projection in `folder`
+    /// (which nodes may share).
+    ///
+    /// # Errors
+    /// When no server answers, it has no JetStream, or the folder cannot be written.
+    pub async fn open(address: &Address, folder: &Path, terms: Terms) -> Result<Self, EngineError> {
+        if terms.lease < link::CALL {
+            tracing::warn!(
+                lease_s = terms.lease.as_secs_f64(),
+                call_s = link::CALL.as_secs(),
+                "leases are shorter than an interruption of the servers may be: jobs will be run again without need"
+            );
+        }
+        let link = Link::open(address).await?;
+        let layout = patiently(Layout::open(&link, address)).await?;
+        let queue = patiently(Queue::open(link.clone(), layout.clone())).await?;
+        let ledger = Arc::new(Ledger { link, layout, projection: Projection::open(folder)? });
+        let feed = Feed::start(ledger.clone()).await?;
+        let node = Arc::new(Node { ledger, queue, feed, terms });
+        let sweeper = tokio::spawn(sweeper::run(Arc::downgrade(&node)));
+        Ok(Self { node, sweeper })
+    }
+}
+
+impl Drop for NatsEngine {
+    fn drop(&mut self) {
+        self.sweeper.abort();
+    }
+}
+
+impl Node {
+    /// The version of a claimed job that this node saw last, if that is not older than the claim.
+    fn seen(&self, claim: &Claim) -> Option<Version> {
+        self.ledger.projection.seen(claim.id).filter(|version| version.record.job.attempt >= claim.attempt)
+    }
+
+    async fn submit(&self, new: NewJob) -> Result<Submitted, EngineError> {
+        let submitted = keys::submit(&self.ledger, new).await?;
+        if let Submitted::Created(job) = &submitted {
+            self.enqueue(job.id).await;
+        }
+        Ok(submitted)
+    }
+
+    /// Puts a job that waits into the queue. Where that fails a sweeper will do it, and the change that made it wait stands.
+    async fn enqueue(&self, id: JobId) {
+        let pushed = tokio::time::timeout(ENQUEUE, self.queue.push(id)).await;
+        let pushed = pushed.unwrap_or_else(|_| Err(EngineError::Store("no answer in time".to_owned())));
+        if let Err(error) = pushed {
+            tracing::warn!(job.id = %id, %error, "a job that waits could not be put into the queue yet");
+        }
+    }
+
+    async fn request_cancel(&self, id: JobId) -> Result<Option<Job>, EngineError> {
+        let changed = self.ledger.change(id, None, |draft| {
+            match draft.record.job.state {
+                State::Queued => draft.go(State::Canceled),
+                State::Running => draft.go(State::Canceling),
+                _ => return Step::Leave(()),
+            }
+            Step::Write(())
+        });
+        Ok(changed.await?.map(|((), record)| record.job.clone()))
+    }
+
+    /// Forgets a job, and decides which blobs nobody names any more.
+    ///
+    /// Jobs that end and jobs that are forgotten are stored in one stream, so there is an order between them. An entry that
+    /// names a blob and comes before the tombstone is seen here, because the projection is waited for; for one that comes
+    /// after it, the job is open now, and as long as any job is open no blob is given up. Nor is one when this node does not
+    /// hear of the others. What is kept so is left to the garbage collection. Left open: a job that is submitted, run and
+    /// ended with the same output within the moment from here to the removal of the blob.
+    async fn forget(&self, id: JobId) -> Result<Forgotten, EngineError> {
+        let (tombstone, record) = loop {
+            let Some(version) = self.ledger.version(id).await? else { return Ok(Forgotten::Unknown) };
+            if !version.record.job.state.ended() {
+                return Ok(Forgotten::Running);
+            }
+            if let Some(seq) = self.ledger.forget(id, &version).await? {
+                break (seq, version.record);
+            }
+        };
+        let hears = self.feed.reaches(tombstone, FORGET).await;
+        if !hears || !self.ledger.projection.open_jobs(|_| true).is_empty() {
+            return Ok(Forgotten::Gone(Vec::new()));
+        }
+        self.ledger.projection.unnamed(record.named_blobs(), None).await.map(Forgotten::Gone)
+    }
+
+    async fn unnamed(&self, blobs: Vec<String>, expired: Option<Timestamp>) -> Result<Vec<String>, EngineError> {
+        // a job that another node has just accepted may not be here yet; what it names was touched before, and is young
+        self.ledger.projection.unnamed(blobs, expired).await
+    }
+
+    async fn renew(&self, claim: &Claim, news: Vec<Update>) -> Result<Renewal, EngineError> {
+        let mut renewal = Renewal::Lost;
+        for news in together(news) {
+            let renewed = self.ledger.change(claim.id, self.seen(claim), |draft| {
+                let standing = draft.record.standing(claim);
+                if standing == Renewal::Lost {
+                    return Step::Leave(standing);
+                }
+                // also without news: the entry is the sign of life
+                news.iter().for_each(|update| draft.tell(update.clone()));
+                Step::Write(standing)
+            });
+            renewal = renewed.await?.map_or(Renewal::Lost, |(standing, _)| standing);
+            if renewal == Renewal::Lost {
+                break;
+            }
+        }
+        Ok(renewal)
+    }
+
+    async fn finish(&self, claim: &Claim, outcome: Outcome) -> Result<(), EngineError> {
+        let ended = self.ledger.change(claim.id, self.seen(claim), |draft| {
+            let standing = draft.record.standing(claim);
+            if standing == Renewal::Lost {
+                return Step::Leave(false);
+            }
+            draft.finish(outcome.clone(), standing);
+            Step::Write(true)
+        });
+        match ended.await? {
+            Some((true, record)) => {
+                if record.job.state == State::Queued {
+                    self.enqueue(claim.id).await;
+                }
+                Ok(())
+            }
+            _ => Err(EngineError::Fenced { id: claim.id, attempt: claim.attempt }),
+        }
+    }
+
+    async fn standing(&self, claim: &Claim) -> Result<Renewal, EngineError> {
+        let version = match self.seen(claim) {
+            Some(version) => Some(version),
+            None => self.ledger.version(claim.id).await?,
+        };
+        Ok(version.map_or(Renewal::Lost, |version| version.record.standing(claim)))
+    }
+
+    async fn events_after(&self, id: JobId, after: u64, limit: usize) -> Result<Option<EventPage>, EngineError> {
+        let projection = &self.ledger.projection;
+        let mut found = projection.events_after(id, after, limit).await?;
+        // another node may have told more than has come here
+        if found.as_ref().is_none_or(|(page, _)| after > page.newest) {
+            if self.ledger.version(id).await?.is_none() {
+                return Ok(None);
+            }
+            found = projection.events_after(id, after, limit).await?;
+        }
+        let Some((page, whole)) = found else { return Ok(None) };
+        let is_here = after >= page.newest || (page.oldest > 0 && after + 1 >= page.oldest);
+        if whole || is_here {
+            return Ok(Some(page));
+        }
+        let (events, seq) = feed::history(&self.ledger, id).await?;
+        projection.complete(id, events, seq).await?;
+        Ok(projection.events_after(id, after, limit).await?.map(|(page, _)| page))
+    }
+
+    async fn health(&self) -> Result<(), EngineError> {
+        if !self.ledger.link.is_up() {
+            return Err(EngineError::Store("there is no connection to the cluster".to_owned()));
+        }
+        let info = self.ledger.layout.jobs.get_info().await.map_err(|e| failed("the stream of jobs")(e.into()))?;
+        if info.cluster.is_some_and(|cluster| cluster.leader.is_none_or(|leader| leader.is_empty())) {
+            return Err(EngineError::Store("the stream of jobs has no leader".to_owned()));
+        }
+        Ok(())
+    }
+}
+
+/// News in portions that fit into one message each; one portion when there are none.
+fn together(news: Vec<Update>) -> Vec<Vec<Update>> {
+    let (mut portions, mut bytes) = (vec![Vec::new()], 0);
+    for update in news {
+        let size = update.data.to_string().len();
+        if bytes > 0 && bytes + size > NEWS_BYTES {
+            portions.push(Vec::new());
+            bytes = 0;
+        }
+        bytes += size;
+        if let Some(portion) = portions.last_mut() {
+            portion.push(update);
+        }
+    }
+    portions
+}
+
+#[async_trait::async_trait]
+impl Engine for NatsEngine {
+    async fn submit(&self, job: NewJob) -> Result<Submitted, EngineError> {
+        patiently(self.node.submit(job)).await
+    }
+
+    async fn recall(&self, key: IdempotencyKey) -> Result<Option<Submitted>, EngineError> {
+        patiently(keys::recall(&self.node.ledger, &key)).await
+    }
+
+    async fn get(&self, id: JobId) -> Result<Option<Job>, EngineError> {
+        let found = patiently(self.node.ledger.read(id)).await?;
+        Ok(match found {
+            Found::Job(version) => Some(version.record.job.clone()),
+            Found::Forgotten | Found::Nothing => None,
+        })
+    }
+
+    async fn spec(&self, id: JobId) -> Result<Option<JobSpec>, EngineError> {
+        let stored = patiently(self.node.ledger.request(id)).await?;
+        let read = |value| JobSpec::from_value(&value).map_err(|faults| EngineError::Store(format!("{faults:?}")));
+        stored.map(read).transpose()
+    }
+
+    async fn list(&self, query: ListQuery) -> Result<Page, EngineError> {
+        self.node.ledger.projection.list(query).await
+    }
+
+    async fn request_cancel(&self, id: JobId) -> Result<Option<Job>, EngineError> {
+        patiently(self.node.request_cancel(id)).await
+    }
+
+    async fn forget(&self, id: JobId) -> Result<Forgotten, EngineError> {
+        patiently(self.node.forget(id)).await
+    }
+
+    async fn claim(&self, worker: &str, slots: usize, wait: Duration) -> Result<Vec<Claim>, EngineError> {
+        claims::take(&self.node, worker, slots, wait).await
+    }
+
+    async fn renew(&self, claim: &Claim, news: Vec<Update>) -> Result<Renewal, EngineError> {
+        patiently(self.node.renew(claim, news)).await
+    }
+
+    async fn interrupted(&self, claim: &Claim) -> Renewal {
+        let mut changes = self.changes(claim.id);
+        loop {
+            match patiently(self.node.standing(claim)).await {
+                Ok(Renewal::Keep) => {}
+                Ok(interruption) => return interruption,
+                // the next heartbeat will tell whether the cluster is really gone
+                Err(error) => tracing::warn!(job.id = %claim.id, %error, "the claim could not be looked at"),
+            }
+            let _ = tokio::time::timeout(LOOK, changes.next()).await;
+        }
+    }
+
+    async fn finish(&self, claim: &Claim, outcome: Outcome) -> Result<(), EngineError> {
+        patiently(self.node.finish(claim, outcome)).await
+    }
+
+    async fn events_after(&self, id: JobId, after: u64, limit: usize) -> Result<Option<EventPage>, EngineError> {
+        patiently(self.node.events_after(id, after, limit)).await
+    }
+
+    fn changes(&self, id: JobId) -> Changes {
+        Changes(self.node.ledger.projection.subscribe(id))
+    }
+
+    async fn health(&self) -> Result<(), EngineError> {
+        tokio::time::timeout(HEALTH, self.node.health())
+            .await
+            .unwrap_or_else(|_| Err(EngineError::Store("no answer from the cluster".to_owned())))
+    }
+}

@@ -1,0 +1,107 @@
+//! What every node does from time to time: finds lost workers and ids that are missing in the queue, and tidies up.
+//!
+//! All nodes do the same, at times of their own; what one has done the others find done. None of it costs a running system
+//! more than a look into this node's own memory, except the housekeeping, once an hour.
+
+use super::Node;
+use super::layout::Layout;
+use super::{housekeeping, leases};
+use crate::engine::EngineError;
+use crate::engine::nats::link::{failed, patiently};
+use crate::job::{JobId, State};
+use futures::TryStreamExt;
+use jiff::Timestamp;
+use std::collections::HashSet;
+use std::sync::Weak;
+use std::time::Duration;
+use tokio::time::Instant;
+use tracing::warn;
+use uuid::Uuid;
+
+/// Longest time between two looks for lost workers; a quarter of the lease when that is shorter.
+const LOOK: Duration = Duration::from_secs(1);
+/// Time after which a queued job's id must be in the queue: a submit has long put it there, or died.
+const SETTLED: Duration = Duration::from_secs(3);
+/// Time between two looks into the queue.
+const QUEUE_LOOK: Duration = Duration::from_secs(5);
+/// Looks that trust the number of ids before one looks at the ids themselves: ids of canceled jobs stay in the queue until
+/// their turn comes, and hide ones that are missing.
+const TRUSTING_LOOKS: u32 = 11;
+/// Time between two housekeepings.
+const HOUSEKEEPING: Duration = Duration::from_secs(60 * 60);
+
+/// Sweeps until the node is gone.
+pub(super) async fn run(node: Weak<Node>) {
+    let (mut next_queue_look, mut next_housekeeping) =
+        (Instant::now() + jittered(SETTLED), Instant::now() + jittered(HOUSEKEEPING));
+    let (mut trusting, mut connections) = (0, None);
+    loop {
+        let Some(lease) = node.upgrade().map(|node| node.terms.lease) else { return };
+        tokio::time::sleep(jittered(LOOK.min(lease / 4))).await;
+        let Some(node) = node.upgrade() else { return };
+        if !node.ledger.link.is_up() {
+            continue;
+        }
+        // after an interruption everybody gets a fresh lease: their heartbeats could not be stored either
+        let connection = Some(*node.ledger.link.connections.borrow());
+        if connections != connection {
+            connections = connection;
+            node.ledger.projection.forgive();
+        }
+        leases::take_from_the_lost(&node).await;
+        if Instant::now() >= next_queue_look {
+            next_queue_look = Instant::now() + jittered(QUEUE_LOOK);
+            trusting = if trusting == 0 { TRUSTING_LOOKS } else { trusting - 1 };
+            if let Err(error) = patiently(put_back_missing(&node, trusting > 0)).await {
+                warn!(%error, "the queue could not be looked at");
+            }
+        }
+        if Instant::now() >= next_housekeeping {
+            next_housekeeping = Instant::now() + jittered(HOUSEKEEPING);
+            if let Err(error) = housekeeping::tidy(&node.ledger, Timestamp::now()).await {
+                warn!(%error, "the housekeeping was not finished");
+            }
+        }
+    }
+}
+
+/// Puts the ids of jobs that wait for long into the queue where they are missing, because a node died between the record and
+/// the queue.
+async fn put_back_missing(node: &Node, trusting: bool) -> Result<(), EngineError> {
+    let waiting = node
+        .ledger
+        .projection
+        .open_jobs(|seen| seen.version.record.job.state == State::Queued && seen.at.elapsed() > SETTLED);
+    if waiting.is_empty() {
+        return Ok(());
+    }
+    let work = &node.ledger.layout.work;
+    if trusting {
+        let info = work.get_info().await.map_err(|e| failed("the queue")(e.into()))?;
+        if info.state.messages >= waiting.len() as u64 {
+            return Ok(());
+        }
+    }
+    let subjects = work.info_builder().subjects(node.ledger.layout.every_work()).fetch().await;
+    let subjects: Vec<(String, usize)> = subjects
+        .map_err(|e| failed("the queue")(e.into()))?
+        .try_collect()
+        .await
+        .map_err(|e| failed("the queue")(e.into()))?;
+    let queued: HashSet<JobId> = subjects.iter().filter_map(|(subject, _)| Layout::id_of(subject)).collect();
+    let mut missing: Vec<JobId> =
+        waiting.iter().map(|seen| seen.version.record.job.id).filter(|id| !queued.contains(id)).collect();
+    missing.sort_unstable();
+    for id in missing {
+        // it may have been taken up meanwhile: then a worker passes it over
+        warn!(job.id = %id, "a job that waits was not in the queue");
+        node.queue.push(id).await?;
+    }
+    Ok(())
+}
+
+/// Three to five quarters of a time, so that nodes that started together do not sweep together.
+fn jittered(time: Duration) -> Duration {
+    let random = Uuid::now_v7().as_bytes()[15];
+    time.mul_f64(0.75 + 0.5 * f64::from(random) / 255.0)
+}
