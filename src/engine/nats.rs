@@ -1,7 +1,7 @@
 //! The cluster engine: NATS JetStream, for any number of nodes.
 //!
-//! Every node has one connection, one consumer that brings it every job's changes, and a [projection](projection) of them
-//! that it lists from. The truth is the [record](record) of a job in its stream, and every change of it is a compare-and-set
+//! Every node has one connection, one consumer that brings it every job's changes, and a `projection` of them that
+//! it lists from. The truth is the `record` of a job in its stream, and every change of it is a compare-and-set
 //! that says from which version it was made; so it does not matter which node, worker or sweeper is late, frozen or cut off.
 //!
 //! | promise | kept by |
@@ -9,9 +9,9 @@
 //! | accepted jobs survive | the record is stored by a majority of the servers before `submit` returns; they must sync (`docker/nats.conf`) |
 //! | one worker at a time | a claim is a compare-and-set from `queued` to `running` under the next attempt |
 //! | only the newest attempt counts | renewing and finishing look at the attempt in the version that they replace |
-//! | lost workers are found | every node [watches heartbeats](leases) by its own clock |
-//! | events have no gap | they are [stored with the record](record), in one message |
-//! | one key, one job | a [key](keys) names its job, and whoever finds it makes that job |
+//! | lost workers are found | every node watches heartbeats by its own clock (`leases`) |
+//! | events have no gap | they are stored with the record, in one message (`record`) |
+//! | one key, one job | a key names its job, and whoever finds it makes that job (`keys`) |
 //!
 //! Not guaranteed beyond what the [room](super) says: a list on one node shows what was submitted on another only once its
 //! feed has brought it, usually within milliseconds; and a job that comes back to the queue waits behind those that are there.
@@ -65,7 +65,7 @@ const NEWS_BYTES: usize = 256 << 10;
 /// One node of the cluster.
 pub struct NatsEngine {
     node: Arc<Node>,
-    sweeper: JoinHandle<()>,
+    tasks: [JoinHandle<()>; 2],
 }
 
 /// What the engine's tasks share.
@@ -96,14 +96,17 @@ impl NatsEngine {
         let ledger = Arc::new(Ledger { link, layout, projection: Projection::open(folder)? });
         let feed = Feed::start(ledger.clone()).await?;
         let node = Arc::new(Node { ledger, queue, feed, terms });
-        let sweeper = tokio::spawn(sweeper::run(Arc::downgrade(&node)));
-        Ok(Self { node, sweeper })
+        let tasks = [
+            tokio::spawn(sweeper::run(Arc::downgrade(&node))),
+            tokio::spawn(housekeeping::run(Arc::downgrade(&node.ledger))),
+        ];
+        Ok(Self { node, tasks })
     }
 }
 
 impl Drop for NatsEngine {
     fn drop(&mut self) {
-        self.sweeper.abort();
+        self.tasks.iter().for_each(JoinHandle::abort);
     }
 }
 

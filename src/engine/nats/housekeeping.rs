@@ -1,15 +1,17 @@
 //! What nobody will ask for any more is removed from the streams: tombstones that no idempotency key remembers, the events of
-//! jobs that ended long ago, and requests whose job was never made.
+//! jobs that ended long ago, and requests whose job was never made. Every node does it, once an hour, at a time of its own.
 
 use super::layout::{KEY_LIFETIME, Layout};
 use super::ledger::{Found, Ledger};
 use super::link::failed;
+use super::sweeper::jittered;
 use crate::engine::EngineError;
 use crate::job::JobId;
 use async_nats::jetstream::stream::Stream;
 use futures::TryStreamExt;
 use jiff::{SignedDuration, Timestamp};
 use std::collections::HashSet;
+use std::sync::Weak;
 use std::time::Duration;
 
 /// Tombstones outlive the keys that may name their job, and clocks that differ by a day.
@@ -20,6 +22,20 @@ const EVENTS: Duration = Duration::from_secs(24 * 60 * 60);
 const EVENTS_AT_HAND: Duration = Duration::from_secs(60 * 60);
 /// A request without a record is one of a submit that is under way, or of one that died; by now it is the latter.
 const UNDER_WAY: Duration = Duration::from_secs(24 * 60 * 60);
+
+/// Time between two times.
+const EVERY: Duration = Duration::from_secs(60 * 60);
+
+/// Keeps house until the node is gone.
+pub(super) async fn run(ledger: Weak<Ledger>) {
+    loop {
+        tokio::time::sleep(jittered(EVERY)).await;
+        let Some(ledger) = ledger.upgrade() else { return };
+        if let Err(error) = tidy(&ledger, Timestamp::now()).await {
+            tracing::warn!(%error, "the housekeeping was not finished");
+        }
+    }
+}
 
 /// Tidies up. What another node removes meanwhile is no error.
 pub(super) async fn tidy(ledger: &Ledger, now: Timestamp) -> Result<(), EngineError> {

@@ -1,16 +1,15 @@
-//! What every node does from time to time: finds lost workers and ids that are missing in the queue, and tidies up.
+//! What every node does all the time: finds lost workers, and ids that are missing in the queue.
 //!
-//! All nodes do the same, at times of their own; what one has done the others find done. None of it costs a running system
-//! more than a look into this node's own memory, except the housekeeping, once an hour.
+//! All nodes do the same, at times of their own; what one has done the others find done. It costs a look into this node's
+//! own memory, and while jobs wait for long a question to the servers every few seconds.
 
 use super::Node;
 use super::layout::Layout;
-use super::{housekeeping, leases};
+use super::leases;
 use crate::engine::EngineError;
 use crate::engine::nats::link::{failed, patiently};
 use crate::job::{JobId, State};
 use futures::TryStreamExt;
-use jiff::Timestamp;
 use std::collections::HashSet;
 use std::sync::Weak;
 use std::time::Duration;
@@ -27,13 +26,10 @@ const QUEUE_LOOK: Duration = Duration::from_secs(5);
 /// Looks that trust the number of ids before one looks at the ids themselves: ids of canceled jobs stay in the queue until
 /// their turn comes, and hide ones that are missing.
 const TRUSTING_LOOKS: u32 = 11;
-/// Time between two housekeepings.
-const HOUSEKEEPING: Duration = Duration::from_secs(60 * 60);
 
 /// Sweeps until the node is gone.
 pub(super) async fn run(node: Weak<Node>) {
-    let (mut next_queue_look, mut next_housekeeping) =
-        (Instant::now() + jittered(SETTLED), Instant::now() + jittered(HOUSEKEEPING));
+    let mut next_queue_look = Instant::now() + jittered(SETTLED);
     let (mut trusting, mut connections) = (0, None);
     loop {
         let Some(lease) = node.upgrade().map(|node| node.terms.lease) else { return };
@@ -54,12 +50,6 @@ pub(super) async fn run(node: Weak<Node>) {
             trusting = if trusting == 0 { TRUSTING_LOOKS } else { trusting - 1 };
             if let Err(error) = patiently(put_back_missing(&node, trusting > 0)).await {
                 warn!(%error, "the queue could not be looked at");
-            }
-        }
-        if Instant::now() >= next_housekeeping {
-            next_housekeeping = Instant::now() + jittered(HOUSEKEEPING);
-            if let Err(error) = housekeeping::tidy(&node.ledger, Timestamp::now()).await {
-                warn!(%error, "the housekeeping was not finished");
             }
         }
     }
@@ -101,7 +91,7 @@ async fn put_back_missing(node: &Node, trusting: bool) -> Result<(), EngineError
 }
 
 /// Three to five quarters of a time, so that nodes that started together do not sweep together.
-fn jittered(time: Duration) -> Duration {
+pub(super) fn jittered(time: Duration) -> Duration {
     let random = Uuid::now_v7().as_bytes()[15];
     time.mul_f64(0.75 + 0.5 * f64::from(random) / 255.0)
 }
