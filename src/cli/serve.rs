@@ -68,7 +68,9 @@ pub fn run(args: &ServeArgs) -> ExitCode {
 async fn open_blobs(config: &Config) -> Result<Blobs, Box<dyn std::error::Error>> {
     if config.blobs == FOLDER {
         if config.engine != SQLITE {
-            tracing::warn!("blobs are in this node's folder: other nodes of the cluster do not see them unless they share it");
+            tracing::warn!(
+                "blobs are in this node's folder: other nodes of the cluster do not see them unless they share it"
+            );
         }
         if config.download_link_s > 0 {
             tracing::warn!("download_link_s does nothing: blobs in a folder have no links");

@@ -41,6 +41,7 @@ use super::{
 };
 use crate::job::{Job, JobId, JobSpec, State};
 use feed::Feed;
+use jiff::Timestamp;
 use layout::Layout;
 use ledger::{Found, Ledger, Step, Version};
 use link::{Link, failed, patiently};
@@ -169,8 +170,13 @@ impl Node {
         self.ledger.projection.unnamed(record.named_blobs(), None).await.map(Forgotten::Gone)
     }
 
+    /// Those of the blobs that no job names. Only asked once everything that was stored so far is here: a node that does not hear of
+    /// the others gives up nothing. What is stored after that is about blobs that were put or touched a moment before.
     async fn unnamed(&self, blobs: Vec<String>, expired: Option<Timestamp>) -> Result<Vec<String>, EngineError> {
-        // a job that another node has just accepted may not be here yet; what it names was touched before, and is young
+        let info = self.ledger.layout.jobs.get_info().await.map_err(|e| failed("the jobs")(e.into()))?;
+        if !self.feed.reaches(info.state.last_sequence, FORGET).await {
+            return Ok(Vec::new());
+        }
         self.ledger.projection.unnamed(blobs, expired).await
     }
 
@@ -305,6 +311,10 @@ impl Engine for NatsEngine {
 
     async fn forget(&self, id: JobId) -> Result<Forgotten, EngineError> {
         patiently(self.node.forget(id)).await
+    }
+
+    async fn unnamed(&self, blobs: Vec<String>, expired: Option<Timestamp>) -> Result<Vec<String>, EngineError> {
+        patiently(self.node.unnamed(blobs, expired)).await
     }
 
     async fn claim(&self, worker: &str, slots: usize, wait: Duration) -> Result<Vec<Claim>, EngineError> {

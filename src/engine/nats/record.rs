@@ -5,8 +5,8 @@
 //! and an outbox between the two.) The newest entry is the job; the older ones are its events.
 
 use crate::engine::{Claim, NewJob, Outcome, Renewal, Update};
-use crate::job::spec::Work;
 use crate::job::spec::INPUT;
+use crate::job::spec::Work;
 use crate::job::{Event, EventKind, Failure, Job, JobId, JobSpec, Output, State};
 use bytes::Bytes;
 use jiff::Timestamp;
