@@ -263,8 +263,8 @@ async fn a_blob_is_named_while_a_job_remembers_it(engine: &Arc<dyn Engine>) {
     let claim = claim_one(engine, "a").await;
     engine.finish(&claim, success(&output)).await.expect("finishes");
     let ended = engine.get(id).await.expect("reads").expect("is there").finished_at.expect("has ended");
-    assert_eq!(unnamed(None).await, [stray.clone()]);
-    assert_eq!(unnamed(Some(ended)).await, [stray.clone()], "it ended then, and not before");
+    assert_eq!(unnamed(None).await, std::slice::from_ref(&stray));
+    assert_eq!(unnamed(Some(ended)).await, std::slice::from_ref(&stray), "it ended then, and not before");
     let later = ended.checked_add(jiff::SignedDuration::from_secs(1)).expect("a time");
     assert_eq!(unnamed(Some(later)).await, [input.hex(), output.clone(), stray.clone()]);
     assert_eq!(engine.forget(id).await.expect("answers"), Forgotten::Gone(vec![output.clone()]), "inputs stay");
