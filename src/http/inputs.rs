@@ -99,8 +99,7 @@ pub async fn upload(State(app): State<App>, RawQuery(raw): RawQuery, body: Body)
     let bytes = body::read(body, app.limits.input_bytes).await?;
     let hashed = bytes.clone();
     let id = tokio::task::spawn_blocking(move || BlobId::of(&hashed)).await.map_err(joined)?;
-    if let Some(note) = app.blobs.note(id).await? {
-        let mut known = read_note(&note)?;
+    if let Some(mut known) = known(&app, id).await? {
         // the note keeps what the first upload said: an answer depends on its own request alone
         if known.options != options {
             known = Input { description: described(bytes, options.clone()).await?, options, ..known };
@@ -109,12 +108,22 @@ pub async fn upload(State(app): State<App>, RawQuery(raw): RawQuery, body: Body)
     }
     let description = described(bytes.clone(), options.clone()).await?;
     let input = Input { id, bytes: bytes.len() as u64, created_at: Timestamp::now(), options, description };
+    let _promise = app.blobs.promise().await;
     app.blobs.put(bytes).await?;
     // the note comes last: an input that is known is complete
     let note = serde_json::to_vec(&input).map_err(|_| Problem::internal())?;
     app.blobs.put_note(id, note.into()).await?;
     let location = HeaderValue::from_str(&format!("/v1/inputs/{id}")).map_err(|_| Problem::internal())?;
     Ok((StatusCode::CREATED, [(header::LOCATION, location)], Json(input)).into_response())
+}
+
+/// The input, if it is there already; from now on it is kept as one that was just uploaded.
+async fn known(app: &App, id: BlobId) -> Result<Option<Input>, Problem> {
+    let _promise = app.blobs.promise().await;
+    if !app.blobs.touch(id).await? {
+        return Ok(None);
+    }
+    app.blobs.note(id).await?.map(|note| read_note(&note)).transpose()
 }
 
 /// What the query says of how to read the file. A value that is no JSON is a name.

@@ -230,3 +230,43 @@ impl From<Failure> for Problem {
         Self::unprocessable(&failure.code, &failure.title, failure.detail).with_errors(failure.errors)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    /// The first words in quotes after every use of a constructor, in all files of the room.
+    fn codes(folder: &Path, found: &mut Vec<String>) {
+        const CONSTRUCTORS: [&str; 6] =
+            ["bad_request(", "not_found(", "conflict(", "unprocessable(", "unavailable(", "Problem::new("];
+        for path in std::fs::read_dir(folder).expect("reads").map(|entry| entry.expect("entry").path()) {
+            if path.is_dir() {
+                codes(&path, found);
+                continue;
+            }
+            let text = std::fs::read_to_string(&path).expect("reads");
+            let code = text.split("#[cfg(test)]").next().unwrap_or_default();
+            for constructor in CONSTRUCTORS {
+                for call in code.split(constructor).skip(1) {
+                    let first = call.split('"').nth(1).unwrap_or_default();
+                    let close = call.find(|c| ['"', ')', ';'].contains(&c));
+                    let is_code = !first.is_empty() && first.bytes().all(|b| b.is_ascii_lowercase() || b == b'_');
+                    if is_code && close.is_some_and(|at| call.as_bytes()[at] == b'"') {
+                        found.push(first.to_owned());
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn every_code_is_documented() {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let documented = std::fs::read_to_string(root.join("docs/problems.md")).expect("reads");
+        let mut found = Vec::new();
+        codes(&root.join("src/http"), &mut found);
+        assert!(found.len() > 20, "{found:?}");
+        let missing: Vec<&String> = found.iter().filter(|code| !documented.contains(&format!("`{code}`"))).collect();
+        assert!(missing.is_empty(), "not in docs/problems.md: {missing:?}");
+    }
+}
