@@ -185,6 +185,7 @@ const FIT_MEMBERS: [&str; 13] = [
     "epochs",
     "samples",
     "sampling",
+    "normalize",
     "batch",
     "learning_rate",
     "normal",

@@ -157,13 +157,15 @@ fn a_fit_is_read_with_its_meshes_and_read_back_as_it_was() {
     let name = |digit: &str| format!("sha256:{}", digit.repeat(64));
     let alone = JobSpec::from_value(&json!({"kind": "fit", "meshes": [name("a")]})).expect("good");
     assert_eq!(alone.outputs, [OutputName::Network, OutputName::Report]);
-    let fit =
-        json!({"layers": 3, "activation": {"sine": {"w0": 20}}, "learning_rate": 5e-4, "sampling": "grid", "seed": 9});
+    let fit = json!({
+        "layers": 3, "activation": {"sine": {"w0": 20}}, "learning_rate": 5e-4, "sampling": "grid", "normalize": true,
+        "seed": 9,
+    });
     let value = json!({"kind": "fit", "meshes": [name("a"), name("b")], "fit": fit, "outputs": ["network"]});
     let spec = JobSpec::from_value(&value).expect("good");
     let Work::Fit(fitting) = &spec.work else { panic!("{spec:?}") };
     assert_eq!((fitting.meshes.len(), fitting.fit.layers, fitting.fit.seed), (2, 3, 9));
-    assert_eq!(fitting.fit.learning_rate, 5e-4);
+    assert_eq!((fitting.fit.learning_rate, fitting.fit.normalize), (5e-4, true));
     assert_eq!(JobSpec::from_value(&serde_json::to_value(&spec).expect("serializes")), Ok(spec));
 }
 
