@@ -177,7 +177,7 @@ fn read_fitting(value: &Value, faults: &mut Faults) -> Fitting {
 }
 
 /// Members of `fit`.
-const FIT_MEMBERS: [&str; 13] = [
+const FIT_MEMBERS: [&str; 14] = [
     "layers",
     "width",
     "activation",
