@@ -247,7 +247,7 @@ fn an_animation_that_makes_no_sense_is_refused() {
         (vec![morph.as_str(), "--latents", &far, "-o", &out], 3, "frame 1: the network comes with 5 latent codes"),
         (vec![&morph, "--latents", &long, "-o", &out], 3, "frame 1: the latent code has 3 entries"),
         (vec![&blob, "--latents", &rows, "-o", &out], 3, "no latent code"),
-        (vec![&morph, "--latents", &morph, "-o", &out], 3, "expected a list"),
+        (vec![&morph, "--latents", &morph, "-o", &out], 3, "expected a .npy array"),
         (vec![&morph, "--latents", &rows], 2, "--output"),
         (vec![&morph, "--latents", &rows, "-o", &out, "--relax-uv"], 2, "the sphere's own UVs"),
         (vec![&morph, "--latents", &rows, "-o", &out, "--fps", "0"], 2, "--fps"),
