@@ -283,7 +283,7 @@ async fn judge(http: &Client, url: &str, id: &str, deadline: Instant, counts: &m
     }
     let page = ask(http, url, &format!("{path}/events?after=0&limit=512"), deadline).await?.unwrap_or_default();
     let events = page["events"].as_array().cloned().unwrap_or_default();
-    let ends = events.iter().filter(|event| event["kind"] == "done").count();
+    let ends = events.iter().filter(|event| event["type"] == "done").count();
     let numbers: Vec<u64> = events.iter().filter_map(|event| event["seq"].as_u64()).collect();
     if ends != 1 || numbers.windows(2).any(|pair| pair[1] != pair[0] + 1) {
         println!("{ends} ends among the events {numbers:?} of {id}");
