@@ -164,6 +164,8 @@ def grids():
     put("npy", "not_finite", npy([3, 2, 2], [float("inf")] * 12))
     put("npy", "huge_numbers", npy([2, 2, 2], [1e18, -1e18] * 4))
     put("npy", "two_axes", npy([3, 4], ramp))
+    put("npy", "codes_fortran", npy([3, 1, 4], ramp, "<f8", True))
+    put("npy", "no_columns", npy([1 << 40, 0], []))
     put("npy", "too_many", npy([1 << 40, 1 << 40, 2], []))
     put("npy", "cut", npy([3, 2, 2], ramp[:5]))
     put("npy", "integers", npy([2, 2, 2], ramp[:8], "<i4"))

@@ -3,7 +3,7 @@
 //! The interpolant is the tensor product of Catmull-Rom cubics: it passes through the samples, its gradient is
 //! continuous, and the gradient that is returned is exactly its own. Samples beyond the rim are continued linearly.
 
-pub(crate) mod npy;
+pub mod npy;
 
 use super::{Domain, Field, FieldError, Gradients, Metric, Points};
 

@@ -92,6 +92,36 @@ async fn several_meshes_get_a_latent_code_each() {
 }
 
 #[tokio::test]
+async fn a_mesh_is_brought_to_the_cube_and_the_report_says_how_to_bring_it_back() {
+    let folder = tempfile::tempdir().expect("folder");
+    let app = App::start(folder.path());
+    let scale = 0.01;
+    let mesh = uploaded(&app, octahedron([scale, 0.8 * scale, 0.9 * scale])).await;
+    let mut request = job(&[&mesh], 60);
+    request["fit"]["normalize"] = json!(true);
+    let ended = app.ended(&app.submit(&request).await).await;
+    assert_eq!((state(&ended), &ended["fit"]["normalize"]), ("succeeded", &json!(true)), "{ended}");
+    let shape = &ended["metrics"]["shapes"][0];
+    assert!(shape["closeness"]["distance"]["mean"].as_f64().expect("a number") < 0.02, "{shape}");
+
+    // wrapped where its mesh was, in a box of its mesh's size
+    let network = uploaded(&app, output(&app, &ended, "network").await).await;
+    let reach = vec![1.3 * scale; 3];
+    let domain = json!({"min": reach.iter().map(|c| -c).collect::<Vec<_>>(), "max": reach});
+    let field = json!({"input": network, "transform": shape["transform"], "domain": domain});
+    let shrink = json!({"lattice": {"octahedral": {"n": 16}}});
+    let wrapped = app.ended(&app.submit(&json!({"field": field, "shrink": shrink, "outputs": ["glb"]})).await).await;
+    assert_eq!(state(&wrapped), "succeeded", "{wrapped}");
+    let glb = output(&app, &wrapped, "glb").await;
+    let (document, buffers, _) = gltf::import_slice(&glb).expect("a GLB");
+    let primitive = document.meshes().next().expect("a mesh").primitives().next().expect("a primitive");
+    let reader = primitive.reader(|buffer| Some(&buffers[buffer.index()]));
+    let farthest = reader.read_positions().expect("positions").map(|p| p[0].abs()).fold(0.0, f32::max);
+    // so small a network rounds the corners
+    assert!((0.8..1.05).contains(&(f64::from(farthest) / scale)), "reaches {farthest} of {scale}");
+}
+
+#[tokio::test]
 async fn training_that_was_killed_goes_on_where_it_was() {
     let folder = tempfile::tempdir().expect("folder");
     let (data, epochs) = (folder.path().join("data"), 300);

@@ -102,7 +102,10 @@ pub(in crate::field) fn header(bytes: &[u8], max_count: usize) -> Result<Header,
 
 /// The rows of an array of shape `[rows, columns]` (or `[rows, 1, columns]`, which some code saves), in single precision; `None` when the
 /// bytes are no array at all.
-pub(crate) fn rows(bytes: &[u8], max_count: usize) -> Option<Result<Vec<Vec<f32>>, FieldError>> {
+///
+/// # Errors
+/// When the bytes are malformed, hold more than `max_count` numbers, or have another shape or type.
+pub fn rows(bytes: &[u8], max_count: usize) -> Option<Result<Vec<Vec<f32>>, FieldError>> {
     claims(bytes).then(|| {
         let header = header(bytes, max_count)?;
         let (rows, columns) = match header.shape[..] {
