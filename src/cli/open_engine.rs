@@ -6,6 +6,13 @@ use crate::engine::sqlite::SqliteEngine;
 use crate::engine::{Engine, Terms};
 use std::sync::Arc;
 use std::time::Duration;
+use tokio::time::Instant;
+
+/// How long a cluster may take to be ready: its servers may have been started together with this node, and have to find each other
+/// and to choose a leader first.
+const READY: Duration = Duration::from_secs(60);
+/// Pause between two tries.
+const PAUSE: Duration = Duration::from_millis(500);
 
 /// Opens the engine. What a cluster's node keeps for itself goes to the data folder.
 pub async fn open_engine(config: &Config) -> Result<Arc<dyn Engine>, Box<dyn std::error::Error>> {
@@ -14,7 +21,16 @@ pub async fn open_engine(config: &Config) -> Result<Arc<dyn Engine>, Box<dyn std
         return Ok(Arc::new(SqliteEngine::open(&config.data_dir, terms)?));
     }
     let address: Address = config.engine.parse()?;
-    let engine = NatsEngine::open(&address, &config.data_dir.join("projection"), terms).await?;
-    tracing::info!(nats.servers = %address, "joined the cluster");
-    Ok(Arc::new(engine))
+    let (folder, patience) = (config.data_dir.join("projection"), Instant::now() + READY);
+    loop {
+        match NatsEngine::open(&address, &folder, terms).await {
+            Ok(engine) => {
+                tracing::info!(nats.servers = %address, "joined the cluster");
+                return Ok(Arc::new(engine));
+            }
+            Err(error) if Instant::now() >= patience => return Err(error.into()),
+            Err(error) => tracing::warn!(%error, "the cluster is not ready yet"),
+        }
+        tokio::time::sleep(PAUSE).await;
+    }
 }

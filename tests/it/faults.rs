@@ -1,5 +1,8 @@
 //! What survives a kill, and what a stop does to those who are connected.
 
+mod cluster;
+mod disk;
+
 use crate::app::{App, PATIENCE, endless, small, state};
 use crate::walk::follow;
 use eventsource_stream::Eventsource;

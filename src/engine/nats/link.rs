@@ -10,7 +10,7 @@ use super::address::Address;
 use crate::engine::EngineError;
 use async_nats::connection::State;
 use async_nats::header::{NATS_EXPECTED_LAST_SUBJECT_SEQUENCE, NATS_MESSAGE_ID, NATS_ROLLUP};
-use async_nats::jetstream::context::PublishErrorKind;
+use async_nats::jetstream::context::{AccountErrorKind, PublishErrorKind};
 use async_nats::jetstream::message::StreamMessage;
 use async_nats::jetstream::stream::{LastRawMessageErrorKind, RawMessageError, Stream};
 use async_nats::jetstream::{self, Context, ErrorCode};
@@ -124,7 +124,13 @@ impl Link {
         let context =
             jetstream::context::ContextBuilder::new().timeout(ANSWER).ack_timeout(ANSWER).build(client.clone());
         let account = context.query_account().await;
-        account.map_err(|e| EngineError::Store(format!("{address} has no JetStream (start it with -js): {e}")))?;
+        account.map_err(|e| {
+            let why = match e.kind() {
+                AccountErrorKind::JetStreamUnavailable => "has no JetStream (start it with -js)",
+                _ => "does not answer, or its servers have not agreed on a leader yet",
+            };
+            EngineError::Store(format!("{address} {why}: {e}"))
+        })?;
         let info = client.server_info();
         if !client.is_server_compatible(OLDEST_SERVER.0, OLDEST_SERVER.1, OLDEST_SERVER.2) {
             warn!(
