@@ -5,6 +5,7 @@
 //! service stops.
 
 pub mod body;
+pub mod caller;
 pub mod conditional;
 pub mod context;
 pub mod events;
@@ -93,7 +94,8 @@ pub fn router(app: App, cors_origins: &[String]) -> axum::Router {
         .fallback(problem::unknown_route)
         .method_not_allowed_fallback(problem::wrong_method)
         .with_state(app)
-        .layer(CatchPanicLayer::custom(problem::panicked));
+        .layer(CatchPanicLayer::custom(problem::panicked))
+        .layer(middleware::from_fn(caller::identify));
     if !cors_origins.is_empty() {
         let origins: Vec<HeaderValue> = cors_origins.iter().filter_map(|o| o.parse().ok()).collect();
         let cors = CorsLayer::new().allow_origin(origins).allow_methods(tower_http::cors::Any);
