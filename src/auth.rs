@@ -1,4 +1,18 @@
-//! Who asks, and what they may.
+//! Who asks, and what they may: by an API key of the service's own ([`key`], [`keys`]), or by a token of an OpenID Connect issuer
+//! ([`issuer`]).
+//!
+//! Guarantees: nothing that is logged, shown or kept holds a secret; a key that is revoked stops working on every node within seconds.
+
+pub mod issuer;
+pub mod key;
+pub mod keys;
+
+pub use issuer::Refused;
+
+use issuer::Issuer;
+use key::ApiKey;
+use keys::KeyRing;
+use std::sync::Arc;
 
 use crate::tenant::Tenant;
 use serde::{Deserialize, Serialize};
@@ -65,6 +79,35 @@ impl Caller {
     /// Who it is, for the log and for limits.
     pub fn whose(&self) -> &Tenant {
         &self.tenant
+    }
+}
+
+/// Tells who asks.
+pub struct Authenticator {
+    /// The service's own keys.
+    pub keys: Arc<KeyRing>,
+    /// An issuer whose tokens count beside them.
+    pub issuer: Option<Issuer>,
+}
+
+impl Authenticator {
+    /// Who asks with this key or token.
+    ///
+    /// # Errors
+    /// When it does not count, or cannot be checked now.
+    pub async fn identify(&self, bearer: &str) -> Result<Caller, Refused> {
+        if ApiKey::is_meant(bearer) {
+            let caller = match ApiKey::parse(bearer) {
+                Some(key) => self.keys.find(&key).await,
+                None => None,
+            };
+            // which of these it is is nobody's business but the owner's
+            return caller.ok_or(Refused::Invalid("the key is unknown, revoked or expired"));
+        }
+        match &self.issuer {
+            Some(issuer) => issuer.identify(bearer).await,
+            None => Err(Refused::Invalid("this is no API key, and tokens of an issuer are not taken here")),
+        }
     }
 }
 

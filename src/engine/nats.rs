@@ -18,6 +18,7 @@
 //! Do not use it for a single machine: the embedded engine needs no servers and is faster.
 
 mod address;
+mod api_keys;
 mod claims;
 mod feed;
 mod housekeeping;
@@ -34,6 +35,7 @@ mod sweeper;
 mod tests;
 
 pub use address::{Address, InvalidAddress, SCHEMES};
+pub use api_keys::NatsKeys;
 
 use super::{
     Changes, Claim, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Page,
