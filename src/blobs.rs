@@ -11,6 +11,7 @@ mod place;
 pub use id::{BlobId, InvalidBlobId};
 pub use place::PlaceError;
 
+use crate::tenant::Tenant;
 use bytes::Bytes;
 use futures::stream::BoxStream;
 use futures::{StreamExt, TryStreamExt};
@@ -110,6 +111,14 @@ impl Blobs {
         self.promises.clone().write_owned().await
     }
 
+    /// Stores bytes that a client sent under their hash, and writes them whether or not they are there: the time that it takes tells
+    /// nobody whether somebody else has sent the same.
+    pub async fn put_unseen(&self, bytes: Bytes) -> Result<BlobId, BlobError> {
+        let (id, bytes) = tokio::task::spawn_blocking(move || (BlobId::of(&bytes), bytes)).await.map_err(joined)?;
+        self.store().put(&blob_path(id), bytes.into()).await?;
+        Ok(id)
+    }
+
     /// Stores bytes under their hash. Storing the same bytes again changes nothing.
     pub async fn put(&self, bytes: Bytes) -> Result<BlobId, BlobError> {
         let (id, bytes) = tokio::task::spawn_blocking(move || (BlobId::of(&bytes), bytes)).await.map_err(joined)?;
@@ -119,9 +128,10 @@ impl Blobs {
         Ok(id)
     }
 
-    /// Makes an input that is about to be named young again, should it have come into years. `false` when it is not there.
-    pub async fn touch(&self, id: BlobId) -> Result<bool, BlobError> {
-        for path in [blob_path(id), note_path(id)] {
+    /// Makes a tenant's input that is about to be named young again, should it have come into years. `false` when the tenant has no
+    /// such input; whether another has is not looked at.
+    pub async fn touch(&self, tenant: &Tenant, id: BlobId) -> Result<bool, BlobError> {
+        for path in [note_path(tenant, id), blob_path(id)] {
             let meta = match self.store().head(&path).await {
                 Ok(meta) => meta,
                 Err(object_store::Error::NotFound { .. }) => return Ok(false),
@@ -146,25 +156,52 @@ impl Blobs {
         old.map_err(BlobError::from).boxed()
     }
 
-    /// Removes a blob and what describes it as an input, unless it was made young since it was listed. Tells whether it did.
+    /// Removes a blob that is no tenant's input, unless it was made young since it was listed. Tells whether it did.
     pub async fn remove_older(&self, id: BlobId, age: Duration) -> Result<bool, BlobError> {
-        match self.store().head(&blob_path(id)).await {
+        self.remove_if_older(&blob_path(id), age).await
+    }
+
+    /// The inputs that their tenants neither uploaded nor named for so long, at least [`Blobs::GRACE`].
+    pub fn notes_older_than(&self, age: Duration) -> BoxStream<'static, Result<(Tenant, BlobId), BlobError>> {
+        let age = age.max(Self::GRACE);
+        let all = self.store().list(Some(&Path::from(NOTES)));
+        let old = all.try_filter_map(move |meta| {
+            std::future::ready(Ok(is_older(&meta, age).then(|| noted_at(&meta.location)).flatten()))
+        });
+        old.map_err(BlobError::from).boxed()
+    }
+
+    /// Removes what describes a tenant's input, unless it was made young since it was listed. Tells whether it did.
+    pub async fn remove_older_note(&self, tenant: &Tenant, id: BlobId, age: Duration) -> Result<bool, BlobError> {
+        self.remove_if_older(&note_path(tenant, id), age).await
+    }
+
+    /// Whether a blob is an input of any tenant.
+    pub async fn is_input(&self, id: BlobId) -> Result<bool, BlobError> {
+        match self.store().head(&note_path(&Tenant::default(), id)).await {
+            Ok(_) => return Ok(true),
+            Err(object_store::Error::NotFound { .. }) => {}
+            Err(error) => return Err(error.into()),
+        }
+        let others = Path::from_iter(note_folder(id));
+        Ok(self.store().list(Some(&others)).try_next().await?.is_some())
+    }
+
+    async fn remove_if_older(&self, path: &Path, age: Duration) -> Result<bool, BlobError> {
+        match self.store().head(path).await {
             Ok(meta) if is_older(&meta, age.max(Self::GRACE)) => {}
             Ok(_) | Err(object_store::Error::NotFound { .. }) => return Ok(false),
             Err(error) => return Err(error.into()),
         }
-        // the note goes first: an input that is known is complete
-        self.delete(&note_path(id)).await?;
-        self.delete(&blob_path(id)).await?;
+        self.delete(path).await?;
         Ok(true)
     }
 
-    /// The jobs whose checkpoints were not written for so long, by name.
-    pub fn checkpoints_older_than(&self, age: Duration) -> BoxStream<'static, Result<String, BlobError>> {
+    /// The jobs whose checkpoints were not written for so long, by tenant and name.
+    pub fn checkpoints_older_than(&self, age: Duration) -> BoxStream<'static, Result<(Tenant, String), BlobError>> {
         let all = self.store().list(Some(&Path::from(CHECKPOINTS)));
         let old = all.try_filter_map(move |meta| {
-            let name = meta.location.filename().map(str::to_owned);
-            std::future::ready(Ok(name.filter(|_| is_older(&meta, age))))
+            std::future::ready(Ok(is_older(&meta, age).then(|| checkpoint_at(&meta.location)).flatten()))
         });
         old.map_err(BlobError::from).boxed()
     }
@@ -187,14 +224,14 @@ impl Blobs {
         Ok(result.into_stream().map_err(BlobError::from).boxed())
     }
 
-    /// Writes the note that describes an input. The first one stays.
-    pub async fn put_note(&self, id: BlobId, note: Bytes) -> Result<(), BlobError> {
-        self.create(&note_path(id), note).await.map(|_| ())
+    /// Writes the note that describes a tenant's input, and makes the blob known to that tenant. The first one stays.
+    pub async fn put_note(&self, tenant: &Tenant, id: BlobId, note: Bytes) -> Result<(), BlobError> {
+        self.create(&note_path(tenant, id), note).await.map(|_| ())
     }
 
-    /// The note that describes an input; `None` when there is no such input.
-    pub async fn note(&self, id: BlobId) -> Result<Option<Bytes>, BlobError> {
-        match self.store().get(&note_path(id)).await {
+    /// The note that describes a tenant's input; `None` when the tenant has no such input.
+    pub async fn note(&self, tenant: &Tenant, id: BlobId) -> Result<Option<Bytes>, BlobError> {
+        match self.store().get(&note_path(tenant, id)).await {
             Ok(found) => Ok(Some(found.bytes().await?)),
             Err(object_store::Error::NotFound { .. }) => Ok(None),
             Err(error) => Err(error.into()),
@@ -211,14 +248,14 @@ impl Blobs {
     }
 
     /// Writes the checkpoint of a job over the one before. Whoever writes it, it is the state of the same computation.
-    pub async fn put_checkpoint(&self, job: &str, bytes: Bytes) -> Result<(), BlobError> {
-        self.store().put(&checkpoint_path(job), bytes.into()).await?;
+    pub async fn put_checkpoint(&self, tenant: &Tenant, job: &str, bytes: Bytes) -> Result<(), BlobError> {
+        self.store().put(&checkpoint_path(tenant, job), bytes.into()).await?;
         Ok(())
     }
 
     /// The checkpoint of a job, if it has one.
-    pub async fn checkpoint(&self, job: &str) -> Result<Option<Bytes>, BlobError> {
-        match self.store().get(&checkpoint_path(job)).await {
+    pub async fn checkpoint(&self, tenant: &Tenant, job: &str) -> Result<Option<Bytes>, BlobError> {
+        match self.store().get(&checkpoint_path(tenant, job)).await {
             Ok(found) => Ok(Some(found.bytes().await?)),
             Err(object_store::Error::NotFound { .. }) => Ok(None),
             Err(error) => Err(error.into()),
@@ -226,8 +263,8 @@ impl Blobs {
     }
 
     /// Removes the checkpoint of a job; one that is not there is no error.
-    pub async fn remove_checkpoint(&self, job: &str) -> Result<(), BlobError> {
-        self.delete(&checkpoint_path(job)).await
+    pub async fn remove_checkpoint(&self, tenant: &Tenant, job: &str) -> Result<(), BlobError> {
+        self.delete(&checkpoint_path(tenant, job)).await
     }
 
     /// Whether the store answers.
@@ -272,8 +309,24 @@ impl Blobs {
 const BLOBS: &str = "sha256";
 const CHECKPOINTS: &str = "checkpoints";
 
-fn checkpoint_path(job: &str) -> Path {
-    Path::from_iter([CHECKPOINTS, job])
+const NOTES: &str = "inputs";
+
+/// `checkpoints/JOB` of the default tenant, as before there were tenants, and `checkpoints/TENANT/JOB` of the others.
+fn checkpoint_path(tenant: &Tenant, job: &str) -> Path {
+    match tenant.is_default() {
+        true => Path::from_iter([CHECKPOINTS, job]),
+        false => Path::from_iter([CHECKPOINTS, tenant.name(), job]),
+    }
+}
+
+/// Whose checkpoint lies at a path, and of which job.
+fn checkpoint_at(path: &Path) -> Option<(Tenant, String)> {
+    let parts: Vec<_> = path.parts().collect();
+    match &parts[..] {
+        [_, job] => Some((Tenant::default(), job.as_ref().to_owned())),
+        [_, tenant, job] => Some((tenant.as_ref().parse().ok()?, job.as_ref().to_owned())),
+        _ => None,
+    }
 }
 
 fn blob_path(id: BlobId) -> Path {
@@ -293,9 +346,32 @@ fn is_older(meta: &ObjectMeta, age: Duration) -> bool {
     Timestamp::now().as_millisecond().saturating_sub(written) > age.as_millis() as i64
 }
 
-fn note_path(id: BlobId) -> Path {
+fn note_folder(id: BlobId) -> [String; 3] {
     let hex = id.hex();
-    Path::from_iter(["inputs".to_owned(), hex[..2].to_owned(), format!("{}.json", &hex[2..])])
+    [NOTES.to_owned(), hex[..2].to_owned(), hex[2..].to_owned()]
+}
+
+/// `inputs/HA/SH.json` of the default tenant, as before there were tenants, and `inputs/HA/SH/TENANT.json` of the others.
+fn note_path(tenant: &Tenant, id: BlobId) -> Path {
+    let [notes, first, rest] = note_folder(id);
+    match tenant.is_default() {
+        true => Path::from_iter([notes, first, format!("{rest}.json")]),
+        false => Path::from_iter([notes, first, rest, format!("{tenant}.json")]),
+    }
+}
+
+/// Whose note lies at a path, and of which blob.
+fn noted_at(path: &Path) -> Option<(Tenant, BlobId)> {
+    let parts: Vec<_> = path.parts().collect();
+    let name = parts.last()?.as_ref().strip_suffix(".json")?;
+    match &parts[..] {
+        [_, first, _] => Some((Tenant::default(), BlobId::from_hex(&format!("{}{name}", first.as_ref()))?)),
+        [_, first, rest, _] => {
+            let id = BlobId::from_hex(&format!("{}{}", first.as_ref(), rest.as_ref()))?;
+            Some((name.parse().ok()?, id))
+        }
+        _ => None,
+    }
 }
 
 fn joined(error: tokio::task::JoinError) -> BlobError {
@@ -319,12 +395,31 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn what_describes_an_input_is_each_tenants_own() {
+        let folder = tempfile::tempdir().expect("folder");
+        let blobs = Blobs::in_folder(folder.path()).expect("store");
+        let [own, other] = ["default", "a.b"].map(|name| name.parse::<Tenant>().expect("a name"));
+        let id = blobs.put_unseen(Bytes::from_static(b"x")).await.expect("puts");
+        assert_eq!(blobs.put_unseen(Bytes::from_static(b"x")).await.expect("again"), id);
+        assert!(!blobs.is_input(id).await.expect("answers"));
+        for (tenant, stranger) in [(&own, &other), (&other, &own)] {
+            blobs.put_note(tenant, id, Bytes::from_static(b"note")).await.expect("notes");
+            assert!(blobs.touch(tenant, id).await.expect("touches") && blobs.is_input(id).await.expect("answers"));
+            assert!(!blobs.touch(stranger, id).await.expect("answers"));
+            assert_eq!(blobs.note(stranger, id).await.expect("answers"), None);
+            assert_eq!(noted_at(&note_path(tenant, id)), Some((tenant.clone(), id)));
+            assert_eq!(checkpoint_at(&checkpoint_path(tenant, "job")), Some((tenant.clone(), "job".to_owned())));
+            blobs.delete(&note_path(tenant, id)).await.expect("deletes");
+        }
+    }
+
+    #[tokio::test]
     async fn what_is_not_there_is_missing_and_what_was_edited_is_damaged() {
         let folder = tempfile::tempdir().expect("folder");
         let blobs = Blobs::in_folder(folder.path()).expect("store");
         let id = BlobId::of(b"x");
         assert!(matches!(blobs.get(id).await, Err(BlobError::Missing)));
-        assert!(matches!(blobs.note(id).await, Ok(None)));
+        assert!(matches!(blobs.note(&Tenant::default(), id).await, Ok(None)));
         blobs.put(Bytes::from_static(b"x")).await.expect("put");
         std::fs::write(folder.path().join(blob_path(id).as_ref()), "y").expect("edit");
         assert!(matches!(blobs.get(id).await, Err(BlobError::Damaged(_))));

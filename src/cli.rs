@@ -11,6 +11,7 @@ pub mod first_job;
 pub mod fit;
 pub mod healthcheck;
 mod interrupt;
+mod keys;
 mod open_engine;
 mod options;
 pub mod sensitivity;
@@ -67,6 +68,9 @@ enum Command {
     /// Carry a gradient of a surface's vertices back to the latent code and the weights of its network
     #[command(after_long_help = sensitivity::EXAMPLES)]
     Sensitivity(sensitivity::SensitivityArgs),
+    /// Make, list and revoke API keys
+    #[command(after_long_help = keys::EXAMPLES)]
+    Keys(keys::KeysArgs),
     /// Print the description of the service (OpenAPI 3.1, YAML)
     Openapi,
     /// Ask a service whether it is ready: exits 0 when it is
@@ -386,6 +390,7 @@ pub fn run() -> ExitCode {
         Command::Compare(args) => compare::run(&args),
         Command::Fit(args) => fit::run(&args),
         Command::Sensitivity(args) => sensitivity::run(&args),
+        Command::Keys(args) => keys::run(&args),
         Command::Openapi => openapi(),
         Command::Healthcheck { url } => healthcheck::run(&url),
     }

@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
-    /// Address to listen on (`SHRINKD_LISTEN`). Loopback, because there is no authentication.
+    /// Address to listen on (`SHRINKD_LISTEN`). Beyond loopback only with authentication, or where `auth.open_beyond_loopback` allows it.
     pub listen: SocketAddr,
     /// Folder of the database and the blobs (`SHRINKD_DATA_DIR`), made when it is not there.
     pub data_dir: PathBuf,
@@ -31,6 +31,8 @@ pub struct Config {
     pub download_link_s: u64,
     /// What this node does (`SHRINKD_ROLE`).
     pub role: Role,
+    /// Who may ask.
+    pub auth: AuthConfig,
     /// Sizes of requests.
     pub limits: Limits,
     /// What is kept, and for how long.
@@ -51,6 +53,67 @@ pub enum Role {
     Api,
     /// Runs jobs only; answers nothing but whether it lives and is ready.
     Worker,
+}
+
+/// Who may ask.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AuthConfig {
+    /// Whether a request must say who asks (`SHRINKD_AUTH__MODE`).
+    pub mode: AuthMode,
+    /// Whether a service that asks nobody may listen beyond loopback (`SHRINKD_AUTH__OPEN_BEYOND_LOOPBACK`), where something else
+    /// keeps strangers away.
+    pub open_beyond_loopback: bool,
+    /// The issuer whose tokens count beside API keys.
+    pub oidc: OidcConfig,
+}
+
+/// Whether a request must say who asks.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum AuthMode {
+    /// Nobody is asked; everything is the default tenant's.
+    #[default]
+    None,
+    /// With an API key, or a token of the issuer.
+    Required,
+}
+
+/// An OpenID Connect issuer.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OidcConfig {
+    /// Its address, as tokens have it in `iss` (`SHRINKD_AUTH__OIDC__ISSUER`); none when it is empty.
+    pub issuer: String,
+    /// What tokens for this service have in `aud` (`SHRINKD_AUTH__OIDC__AUDIENCE`).
+    pub audience: String,
+    /// Where its keys are (`SHRINKD_AUTH__OIDC__JWKS_URL`); when it is empty the issuer is asked.
+    pub jwks_url: String,
+    /// Algorithms of signatures that count (`SHRINKD_AUTH__OIDC__ALGORITHMS`).
+    pub algorithms: Vec<String>,
+    /// The claim that names the tenant (`SHRINKD_AUTH__OIDC__TENANT_CLAIM`).
+    pub tenant_claim: String,
+    /// The claim with the scopes (`SHRINKD_AUTH__OIDC__SCOPE_CLAIM`): words in one text, or a list.
+    pub scope_claim: String,
+    /// What this service's scopes begin with there (`SHRINKD_AUTH__OIDC__SCOPE_PREFIX`).
+    pub scope_prefix: String,
+    /// Seconds that clocks may differ (`SHRINKD_AUTH__OIDC__LEEWAY_S`).
+    pub leeway_s: u64,
+}
+
+impl Default for OidcConfig {
+    fn default() -> Self {
+        Self {
+            issuer: String::new(),
+            audience: String::new(),
+            jwks_url: String::new(),
+            algorithms: ["RS256", "ES256", "EdDSA"].map(str::to_owned).to_vec(),
+            tenant_claim: "tenant".to_owned(),
+            scope_claim: "scope".to_owned(),
+            scope_prefix: "shrinkd:".to_owned(),
+            leeway_s: 30,
+        }
+    }
 }
 
 /// What is kept, and for how long.
@@ -129,6 +192,7 @@ impl Default for Config {
             blobs: FOLDER.to_owned(),
             download_link_s: 0,
             role: Role::All,
+            auth: AuthConfig::default(),
             retention: Retention { outputs_s: 0, inputs_s: 7 * 24 * 3600, every_s: 3600 },
             limits: Limits { body_bytes: 1 << 20, input_bytes: 256 << 20 },
             worker: WorkerConfig { slots: 2, threads: 0, lease_s: 30, max_losses: 5 },
@@ -174,10 +238,23 @@ impl Config {
         if let Some((_, why)) = wrong.iter().find(|(is_wrong, _)| *is_wrong) {
             return Err(ConfigError::Impossible(why));
         }
+        if !config.auth.oidc.issuer.is_empty() && config.auth.mode == AuthMode::None {
+            return Err(ConfigError::Impossible("auth.oidc does nothing unless auth.mode is \"required\""));
+        }
         if config.engine != SQLITE {
             config.engine.parse::<Address>()?;
         }
         Ok(config)
+    }
+}
+
+impl Config {
+    /// Whether it would let strangers in: beyond loopback, without asking who they are, and without having been told to.
+    pub fn is_open_to_strangers(&self) -> bool {
+        self.role != Role::Worker
+            && self.auth.mode == AuthMode::None
+            && !self.auth.open_beyond_loopback
+            && !self.listen.ip().is_loopback()
     }
 }
 
@@ -214,6 +291,18 @@ mod tests {
         let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/shrinkd.toml");
         let documented: Config = Figment::from(Toml::file_exact(file)).extract().expect("names every setting");
         assert_eq!(documented, Config::default());
+    }
+
+    #[test]
+    fn strangers_are_let_in_only_where_it_is_said() {
+        let beyond = Config { listen: "0.0.0.0:80".parse().expect("an address"), ..Config::default() };
+        assert!(beyond.is_open_to_strangers() && !Config::default().is_open_to_strangers());
+        for auth in [
+            AuthConfig { mode: AuthMode::Required, ..AuthConfig::default() },
+            AuthConfig { open_beyond_loopback: true, ..AuthConfig::default() },
+        ] {
+            assert!(!Config { auth, ..beyond.clone() }.is_open_to_strangers());
+        }
     }
 
     #[test]

@@ -3,6 +3,8 @@
 //! Guarantees of every engine, checked by [`conformance`]: a submitted job is durable before [`Engine::submit`] returns; it
 //! is held by one worker at a time, in attempts that are numbered from 1; only the newest attempt can change it, and it ends
 //! once; its events are numbered from 1 without a gap, and are durable before anyone reads them.
+//! Every job belongs to a [`Tenant`]. Whoever asks about a job says for whom, and another tenant's job is not there: it is looked
+//! for where it is not, so that neither the answer nor its time differs from that of a job which never was.
 //! Not guaranteed: that a job runs only once (a worker that is lost in the middle is followed by another attempt), and that
 //! old events are kept (a reader that comes too late gets a fresh snapshot).
 
@@ -11,6 +13,7 @@ pub mod nats;
 pub mod sqlite;
 
 use crate::job::{Event, EventKind, Failure, Job, JobId, JobSpec, Output, ProgressView, State};
+use crate::tenant::Tenant;
 use futures::stream::BoxStream;
 use jiff::Timestamp;
 use std::collections::VecDeque;
@@ -33,7 +36,7 @@ impl Default for Terms {
     }
 }
 
-/// A key that makes a submit repeatable, and what it was used for.
+/// A key that makes a submit repeatable, and what it was used for. Every tenant has keys of its own.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct IdempotencyKey {
     /// The key, as the client chose it.
@@ -45,6 +48,8 @@ pub struct IdempotencyKey {
 /// A job to accept.
 #[derive(Clone, Debug)]
 pub struct NewJob {
+    /// Whose it is.
+    pub tenant: Tenant,
     /// Its name.
     pub id: JobId,
     /// The checked request.
@@ -107,6 +112,8 @@ pub enum Forgotten {
 /// A worker's hold on a job for one attempt.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Claim {
+    /// Whose job it is.
+    pub tenant: Tenant,
     /// The job.
     pub id: JobId,
     /// The attempt, from 1.
@@ -198,21 +205,27 @@ pub trait Engine: Send + Sync {
     /// Accepts a job.
     async fn submit(&self, job: NewJob) -> Result<Submitted, EngineError>;
     /// What a submit with this key would be answered without accepting anything; `None` when the key is new.
-    async fn recall(&self, key: IdempotencyKey) -> Result<Option<Submitted>, EngineError>;
+    async fn recall(&self, tenant: &Tenant, key: IdempotencyKey) -> Result<Option<Submitted>, EngineError>;
     /// The record of a job.
-    async fn get(&self, id: JobId) -> Result<Option<Job>, EngineError>;
+    async fn get(&self, tenant: &Tenant, id: JobId) -> Result<Option<Job>, EngineError>;
     /// The request of a job.
-    async fn spec(&self, id: JobId) -> Result<Option<JobSpec>, EngineError>;
+    async fn spec(&self, tenant: &Tenant, id: JobId) -> Result<Option<JobSpec>, EngineError>;
     /// A page of records.
-    async fn list(&self, query: ListQuery) -> Result<Page, EngineError>;
+    async fn list(&self, tenant: &Tenant, query: ListQuery) -> Result<Page, EngineError>;
     /// Asks for a job to be stopped: a queued one ends at once, a running one is told. The record afterwards.
-    async fn request_cancel(&self, id: JobId) -> Result<Option<Job>, EngineError>;
+    async fn request_cancel(&self, tenant: &Tenant, id: JobId) -> Result<Option<Job>, EngineError>;
     /// Forgets an ended job.
-    async fn forget(&self, id: JobId) -> Result<Forgotten, EngineError>;
+    async fn forget(&self, tenant: &Tenant, id: JobId) -> Result<Forgotten, EngineError>;
 
-    /// Those of these blobs (hexadecimal SHA-256) that no job names: neither as an input nor as an output. Jobs that ended before
-    /// `expired` do not count, where it is given. When in doubt a blob counts as named.
-    async fn unnamed(&self, blobs: Vec<String>, expired: Option<Timestamp>) -> Result<Vec<String>, EngineError>;
+    /// Those of these blobs (hexadecimal SHA-256) that no job names: neither as an input nor as an output. Only the jobs of `whose`
+    /// count, where it is given; and jobs that ended before `expired` do not, where that is given. When in doubt a blob counts as
+    /// named.
+    async fn unnamed(
+        &self,
+        whose: Option<&Tenant>,
+        blobs: Vec<String>,
+        expired: Option<Timestamp>,
+    ) -> Result<Vec<String>, EngineError>;
 
     /// Takes up to `slots` jobs, oldest first, waiting at most `wait` for the first.
     async fn claim(&self, worker: &str, slots: usize, wait: Duration) -> Result<Vec<Claim>, EngineError>;
@@ -227,9 +240,15 @@ pub trait Engine: Send + Sync {
     async fn finish(&self, claim: &Claim, outcome: Outcome) -> Result<(), EngineError>;
 
     /// The stored events of a job after a sequence number, at most `limit`; `None` when there is no such job.
-    async fn events_after(&self, id: JobId, after: u64, limit: usize) -> Result<Option<EventPage>, EngineError>;
+    async fn events_after(
+        &self,
+        tenant: &Tenant,
+        id: JobId,
+        after: u64,
+        limit: usize,
+    ) -> Result<Option<EventPage>, EngineError>;
     /// The job's events from now on. Every change of a record is told by an event.
-    fn changes(&self, id: JobId) -> Changes;
+    fn changes(&self, tenant: &Tenant, id: JobId) -> Changes;
     /// Whether the engine can do its work.
     async fn health(&self) -> Result<(), EngineError>;
 }
@@ -271,13 +290,15 @@ const PAGE: usize = 64;
 /// `done` event. `None` when there is no such job.
 pub async fn follow(
     engine: Arc<dyn Engine>,
+    tenant: &Tenant,
     id: JobId,
     after: Option<u64>,
 ) -> Result<Option<BoxStream<'static, Result<Event, EngineError>>>, EngineError> {
     // subscribed before reading, so that nothing falls between
-    let changes = engine.changes(id);
-    let Some(page) = engine.events_after(id, after.unwrap_or(u64::MAX), PAGE).await? else { return Ok(None) };
-    let mut follower = Follower { engine, id, changes, pending: VecDeque::new(), position: 0, over: false };
+    let changes = engine.changes(tenant, id);
+    let Some(page) = engine.events_after(tenant, id, after.unwrap_or(u64::MAX), PAGE).await? else { return Ok(None) };
+    let tenant = tenant.clone();
+    let mut follower = Follower { engine, tenant, id, changes, pending: VecDeque::new(), position: 0, over: false };
     match after {
         Some(after) if after <= page.newest && after.saturating_add(1) >= page.oldest => {
             follower.position = after;
@@ -293,6 +314,7 @@ pub async fn follow(
 
 struct Follower {
     engine: Arc<dyn Engine>,
+    tenant: Tenant,
     id: JobId,
     changes: Changes,
     pending: VecDeque<Event>,
@@ -328,9 +350,8 @@ impl Follower {
                 self.pending.push_back(Event::clone(&event));
                 continue;
             }
-            let page =
-                self.engine.events_after(self.id, self.position, PAGE).await.inspect_err(|_| self.over = true)?;
-            match page {
+            let page = self.engine.events_after(&self.tenant, self.id, self.position, PAGE).await;
+            match page.inspect_err(|_| self.over = true)? {
                 None => self.over = true,
                 Some(page) if page.events.is_empty() => {
                     if page.job.state.ended() && self.position >= page.newest {

@@ -5,6 +5,7 @@
 //! service stops.
 
 pub mod body;
+pub mod caller;
 pub mod conditional;
 pub mod context;
 pub mod events;
@@ -20,6 +21,7 @@ pub mod query;
 
 pub use problem::Problem;
 
+use crate::auth::Authenticator;
 use crate::blobs::Blobs;
 use crate::config::{Limits, Retention};
 use crate::engine::Engine;
@@ -86,18 +88,22 @@ pub fn health_router(app: App) -> axum::Router {
     router.with_state(app).layer(middleware::from_fn(context::request))
 }
 
-/// The service. Browsers of other origins are let in only when `cors_origins` names them.
-pub fn router(app: App, cors_origins: &[String]) -> axum::Router {
+/// The service, for those whom the authenticator knows, or for everybody where there is none. Browsers of other origins are let in only when `cors_origins` names them.
+pub fn router(app: App, authenticator: Option<Arc<Authenticator>>, cors_origins: &[String]) -> axum::Router {
     let (router, _) = api().split_for_parts();
     let mut router = router
         .fallback(problem::unknown_route)
         .method_not_allowed_fallback(problem::wrong_method)
         .with_state(app)
-        .layer(CatchPanicLayer::custom(problem::panicked));
+        .layer(CatchPanicLayer::custom(problem::panicked))
+        .layer(middleware::from_fn_with_state(authenticator, caller::identify));
     if !cors_origins.is_empty() {
         let origins: Vec<HeaderValue> = cors_origins.iter().filter_map(|o| o.parse().ok()).collect();
         let cors = CorsLayer::new().allow_origin(origins).allow_methods(tower_http::cors::Any);
-        router = router.layer(cors.allow_headers(tower_http::cors::Any).expose_headers(tower_http::cors::Any));
+        // a wildcard would not include Authorization
+        router = router.layer(
+            cors.allow_headers(tower_http::cors::AllowHeaders::mirror_request()).expose_headers(tower_http::cors::Any),
+        );
     }
     router.layer(middleware::from_fn(context::request))
 }

@@ -1,6 +1,7 @@
 //! `shrinkd` turns a signed distance field into a parameterized surface: it contracts a sphere onto the zero level set and
 //! keeps the sphere's coordinates as UVs.
 
+pub mod auth;
 pub mod blobs;
 pub mod cli;
 pub mod config;
@@ -15,3 +16,4 @@ pub mod settings;
 pub mod shrink;
 pub mod surface;
 pub mod telemetry;
+pub mod tenant;

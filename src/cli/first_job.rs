@@ -1,5 +1,6 @@
 //! `shrinkd serve --try FIELD`: a first job through the service's own routes, so that a new set-up shows a result.
 
+use crate::auth::Caller;
 use axum::Router;
 use axum::body::Body;
 use axum::http::{Method, Request, header};
@@ -50,7 +51,10 @@ async fn ask(
     if !media_type.is_empty() {
         request = request.header(header::CONTENT_TYPE, media_type);
     }
-    let answer = router.clone().oneshot(request.body(body)?).await?;
+    // from within, where nobody has to say who asks
+    let mut request = request.body(body)?;
+    request.extensions_mut().insert(Caller::anybody());
+    let answer = router.clone().oneshot(request).await?;
     /// A job document with its report is a few kilobytes.
     const LARGEST: usize = 1 << 20;
     Ok(serde_json::from_slice(&axum::body::to_bytes(answer.into_body(), LARGEST).await?)?)

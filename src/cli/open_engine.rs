@@ -1,7 +1,8 @@
-//! The engine that the configuration names.
+//! The engine that the configuration names, and the keys beside it.
 
+use crate::auth::keys::{KeyFile, KeyStore};
 use crate::config::{Config, SQLITE};
-use crate::engine::nats::{Address, NatsEngine};
+use crate::engine::nats::{Address, NatsEngine, NatsKeys};
 use crate::engine::sqlite::SqliteEngine;
 use crate::engine::{Engine, Terms};
 use std::sync::Arc;
@@ -33,4 +34,13 @@ pub async fn open_engine(config: &Config) -> Result<Arc<dyn Engine>, Box<dyn std
         }
         tokio::time::sleep(PAUSE).await;
     }
+}
+
+/// Opens the store of API keys, which is there also while a service has the engine.
+pub async fn open_keys(config: &Config) -> Result<Arc<dyn KeyStore>, Box<dyn std::error::Error>> {
+    if config.engine == SQLITE {
+        return Ok(Arc::new(KeyFile::open(&config.data_dir)?));
+    }
+    let address: Address = config.engine.parse()?;
+    Ok(Arc::new(NatsKeys::open(&address).await?))
 }

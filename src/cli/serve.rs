@@ -1,9 +1,12 @@
 //! `shrinkd serve`: puts the rooms together and runs them until a signal comes.
 
-use super::open_engine::open_engine;
+use super::open_engine::{open_engine, open_keys};
 use super::{BAD_USAGE, FAILED, ServeArgs, fail, first_job};
+use crate::auth::Authenticator;
+use crate::auth::issuer::Issuer;
+use crate::auth::keys::KeyRing;
 use crate::blobs::Blobs;
-use crate::config::{Config, FOLDER, Role, SQLITE};
+use crate::config::{AuthMode, Config, FOLDER, Role, SQLITE};
 use crate::http::{self, App};
 use crate::job::collector;
 use crate::job::worker::Worker;
@@ -48,6 +51,11 @@ pub fn run(args: &ServeArgs) -> ExitCode {
         Ok(config) => config,
         Err(error) => return fail(BAD_USAGE, &error),
     };
+    if config.is_open_to_strangers() {
+        let why = "listening beyond loopback needs auth.mode = \"required\", or auth.open_beyond_loopback = true where something else \
+                   keeps strangers away";
+        return fail(BAD_USAGE, &why);
+    }
     if let Err(error) = telemetry::start(&config.log) {
         return fail(BAD_USAGE, &error);
     }
@@ -89,6 +97,21 @@ async fn open_blobs(config: &Config) -> Result<Blobs, Box<dyn std::error::Error>
     Ok(blobs)
 }
 
+/// What tells who asks; `None` where nobody is asked.
+async fn open_authenticator(
+    config: &Config,
+    stop: &CancellationToken,
+) -> Result<Option<Arc<Authenticator>>, Box<dyn std::error::Error>> {
+    if config.auth.mode == AuthMode::None || config.role == Role::Worker {
+        return Ok(None);
+    }
+    let keys = Arc::new(KeyRing::open(open_keys(config).await?).await?);
+    tokio::spawn(keys.clone().watch(stop.clone()));
+    let oidc = &config.auth.oidc;
+    let issuer = if oidc.issuer.is_empty() { None } else { Some(Issuer::new(oidc)?) };
+    Ok(Some(Arc::new(Authenticator { keys, issuer })))
+}
+
 async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std::error::Error>> {
     let engine = open_engine(&config).await?;
     let blobs = open_blobs(&config).await?;
@@ -97,11 +120,12 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
         .thread_name(|i| format!("pool-{i}"))
         .build()?;
     let stop = CancellationToken::new();
+    let authenticator = open_authenticator(&config, &stop).await?;
     let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
 
     let listener = TcpListener::bind(config.listen).await?;
     let address = listener.local_addr()?;
-    if !address.ip().is_loopback() {
+    if !address.ip().is_loopback() && config.auth.mode == AuthMode::None && config.role != Role::Worker {
         tracing::warn!("listening beyond loopback without authentication: whoever reaches this address can use it");
     }
     let (engine_of_worker, blobs_of_worker) = (engine.clone(), blobs.clone());
@@ -124,7 +148,7 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
     };
     let router = match config.role {
         Role::Worker => http::health_router(app),
-        Role::All | Role::Api => http::router(app, &config.cors_origins),
+        Role::All | Role::Api => http::router(app, authenticator, &config.cors_origins),
     };
     let routes = router.clone();
     let graceful = axum::serve(listener, router).with_graceful_shutdown(stop.clone().cancelled_owned());

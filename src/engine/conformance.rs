@@ -14,6 +14,7 @@ use super::{
 use crate::blobs::BlobId;
 use crate::job::spec::{WarmStartSpec, Work};
 use crate::job::{Event, EventKind, Failure, JobId, JobSpec, Output, ProgressView, State};
+use crate::tenant::Tenant;
 use futures::StreamExt;
 use jiff::Timestamp;
 use serde_json::json;
@@ -25,6 +26,11 @@ pub const LEASE: Duration = Duration::from_millis(1500);
 /// Longer than any step of the suite may take.
 const PATIENCE: Duration = Duration::from_secs(20);
 
+/// Whose the suite's jobs are, where it is not about tenants.
+fn own() -> Tenant {
+    Tenant::default()
+}
+
 /// A small valid job, not submitted yet.
 pub fn new_job() -> NewJob {
     labeled("suite", "conformance")
@@ -34,7 +40,7 @@ fn labeled(name: &str, value: &str) -> NewJob {
     let request = json!({"field": {"scene": {"sphere": {"radius": 0.5}}}, "labels": {name: value}});
     let spec =
         JobSpec::from_value(&request).unwrap_or_else(|faults| panic!("the suite's own job is refused: {faults:?}"));
-    NewJob { id: JobId::new(), spec, key: None }
+    NewJob { tenant: own(), id: JobId::new(), spec, key: None }
 }
 
 /// Runs every claim, one after the other, on an engine that holds no job.
@@ -57,6 +63,8 @@ pub async fn run(engine: Arc<dyn Engine>) {
     only_an_ended_job_is_forgotten(&engine).await;
     a_surface_is_kept_for_the_jobs_that_begin_from_it(&engine).await;
     a_blob_is_named_while_a_job_remembers_it(&engine).await;
+    another_tenants_job_is_not_there(&engine).await;
+    keys_and_labels_are_each_tenants_own(&engine).await;
     engine.health().await.expect("healthy");
 }
 
@@ -74,7 +82,7 @@ async fn claim_one(engine: &Arc<dyn Engine>, worker: &str) -> Claim {
 }
 
 async fn state(engine: &Arc<dyn Engine>, id: JobId) -> State {
-    engine.get(id).await.expect("reads").expect("is there").state
+    engine.get(&own(), id).await.expect("reads").expect("is there").state
 }
 
 fn success(sha256: &str) -> Outcome {
@@ -96,26 +104,26 @@ fn progress(fraction: f32) -> Update {
 
 async fn a_job_lives_from_submit_to_its_end(engine: &Arc<dyn Engine>) {
     let id = submit(engine, new_job()).await;
-    let queued = engine.get(id).await.expect("reads").expect("is there");
+    let queued = engine.get(&own(), id).await.expect("reads").expect("is there");
     assert_eq!((queued.state, queued.attempt, queued.started_at), (State::Queued, 0, None));
     let claim = claim_one(engine, "a").await;
     assert_eq!((claim.id, claim.attempt), (id, 1));
-    let running = engine.get(id).await.expect("reads").expect("is there");
+    let running = engine.get(&own(), id).await.expect("reads").expect("is there");
     assert_eq!(running.state, State::Running);
     assert!(running.revision > queued.revision && running.started_at.is_some());
     assert_eq!(engine.renew(&claim, vec![progress(0.5)]).await.expect("renews"), Renewal::Keep);
-    let later = engine.get(id).await.expect("reads").expect("is there");
+    let later = engine.get(&own(), id).await.expect("reads").expect("is there");
     assert!(later.revision > running.revision);
     assert_eq!(later.progress.map(|p| p.fraction), Some(0.5));
     engine.finish(&claim, success("aa")).await.expect("finishes");
-    let ended = engine.get(id).await.expect("reads").expect("is there");
+    let ended = engine.get(&own(), id).await.expect("reads").expect("is there");
     assert_eq!(ended.state, State::Succeeded);
     assert_eq!((ended.outputs.len(), ended.problem), (1, None));
     assert!(ended.finished_at >= ended.started_at && ended.metrics.is_some());
     let again = engine.finish(&claim, success("bb")).await;
     assert!(matches!(again, Err(EngineError::Fenced { .. })), "a job ends once: {again:?}");
     assert_eq!(engine.renew(&claim, Vec::new()).await.expect("answers"), Renewal::Lost);
-    assert_eq!(engine.get(JobId::new()).await.expect("reads"), None);
+    assert_eq!(engine.get(&own(), JobId::new()).await.expect("reads"), None);
 }
 
 async fn jobs_are_claimed_oldest_first_and_once(engine: &Arc<dyn Engine>) {
@@ -131,7 +139,7 @@ async fn jobs_are_claimed_oldest_first_and_once(engine: &Arc<dyn Engine>) {
     assert!(engine.claim("c", 3, Duration::ZERO).await.expect("claims").is_empty());
     for claim in claims {
         engine.finish(&claim, Outcome::failed(Failure::internal())).await.expect("finishes");
-        let job = engine.get(claim.id).await.expect("reads").expect("is there");
+        let job = engine.get(&own(), claim.id).await.expect("reads").expect("is there");
         assert_eq!(job.problem.map(|p| p.code).as_deref(), Some("internal"));
     }
 }
@@ -163,7 +171,7 @@ async fn a_key_makes_a_submit_repeatable(engine: &Arc<dyn Engine>) {
     assert_eq!(engine.submit(keyed("two")).await.expect("answers"), Submitted::KeyConflict);
     let recall = async |fingerprint: &str, key: &str| {
         let key = IdempotencyKey { key: key.to_owned(), fingerprint: fingerprint.to_owned() };
-        engine.recall(key).await.expect("answers")
+        engine.recall(&own(), key).await.expect("answers")
     };
     assert_eq!(recall("one", "k").await, Some(Submitted::Replayed(answers[0].clone())));
     assert_eq!(recall("two", "k").await, Some(Submitted::KeyConflict));
@@ -176,12 +184,12 @@ async fn a_key_makes_a_submit_repeatable(engine: &Arc<dyn Engine>) {
 
 async fn a_queued_job_is_canceled_at_once(engine: &Arc<dyn Engine>) {
     let id = submit(engine, new_job()).await;
-    let job = engine.request_cancel(id).await.expect("cancels").expect("is there");
+    let job = engine.request_cancel(&own(), id).await.expect("cancels").expect("is there");
     assert_eq!(job.state, State::Canceled);
     assert!(engine.claim("a", 1, Duration::ZERO).await.expect("claims").is_empty());
-    let again = engine.request_cancel(id).await.expect("answers").expect("is there");
+    let again = engine.request_cancel(&own(), id).await.expect("answers").expect("is there");
     assert_eq!(again, job, "cancelling what has ended changes nothing");
-    assert_eq!(engine.request_cancel(JobId::new()).await.expect("answers"), None);
+    assert_eq!(engine.request_cancel(&own(), JobId::new()).await.expect("answers"), None);
 }
 
 async fn a_running_job_is_told_to_stop(engine: &Arc<dyn Engine>) {
@@ -191,7 +199,7 @@ async fn a_running_job_is_told_to_stop(engine: &Arc<dyn Engine>) {
         let (engine, claim) = (engine.clone(), claim.clone());
         async move { engine.interrupted(&claim).await }
     });
-    let job = engine.request_cancel(claim.id).await.expect("cancels").expect("is there");
+    let job = engine.request_cancel(&own(), claim.id).await.expect("cancels").expect("is there");
     assert_eq!(job.state, State::Canceling);
     let told = tokio::time::timeout(PATIENCE, waiting).await.expect("in time").expect("no panic");
     assert_eq!(told, Renewal::CancelRequested);
@@ -208,10 +216,10 @@ async fn a_worker_that_lost_its_lease_cannot_finish(engine: &Arc<dyn Engine>) {
     assert_eq!(engine.renew(&first, vec![progress(0.9)]).await.expect("answers"), Renewal::Lost);
     assert_eq!(engine.interrupted(&first).await, Renewal::Lost);
     assert!(matches!(engine.finish(&first, success("aa")).await, Err(EngineError::Fenced { .. })));
-    let job = engine.get(id).await.expect("reads").expect("is there");
+    let job = engine.get(&own(), id).await.expect("reads").expect("is there");
     assert_eq!((job.state, job.progress), (State::Running, None), "the lost attempt left no trace");
     engine.finish(&second, success("bb")).await.expect("finishes");
-    assert_eq!(engine.get(id).await.expect("reads").expect("is there").outputs[0].sha256, "bb");
+    assert_eq!(engine.get(&own(), id).await.expect("reads").expect("is there").outputs[0].sha256, "bb");
 }
 
 async fn a_renewed_lease_holds(engine: &Arc<dyn Engine>) {
@@ -234,7 +242,7 @@ async fn a_job_that_is_given_back_runs_again(engine: &Arc<dyn Engine>) {
         engine.finish(&claim, Outcome::Released).await.expect("gives back");
         assert_eq!(state(engine, id).await, State::Queued);
     }
-    engine.request_cancel(id).await.expect("cancels");
+    engine.request_cancel(&own(), id).await.expect("cancels");
 }
 
 async fn a_job_that_is_lost_too_often_fails(engine: &Arc<dyn Engine>) {
@@ -243,7 +251,7 @@ async fn a_job_that_is_lost_too_often_fails(engine: &Arc<dyn Engine>) {
         assert_eq!(claim_one(engine, "doomed").await.attempt, attempt);
     }
     assert!(engine.claim("b", 1, LEASE * 2).await.expect("claims").is_empty());
-    let job = engine.get(id).await.expect("reads").expect("is there");
+    let job = engine.get(&own(), id).await.expect("reads").expect("is there");
     assert_eq!(job.state, State::Failed);
     assert_eq!(job.problem.map(|p| p.code).as_deref(), Some("attempts_exhausted"));
 }
@@ -254,25 +262,25 @@ async fn a_blob_is_named_while_a_job_remembers_it(engine: &Arc<dyn Engine>) {
     let request = json!({"field": {"input": input.to_string()}});
     let spec =
         JobSpec::from_value(&request).unwrap_or_else(|faults| panic!("the suite's own job is refused: {faults:?}"));
-    let id = submit(engine, NewJob { id: JobId::new(), spec, key: None }).await;
+    let id = submit(engine, NewJob { tenant: own(), id: JobId::new(), spec, key: None }).await;
     let unnamed = async |expired: Option<Timestamp>| {
         let blobs = vec![input.hex(), output.clone(), stray.clone()];
-        engine.unnamed(blobs, expired).await.expect("answers")
+        engine.unnamed(None, blobs, expired).await.expect("answers")
     };
     assert_eq!(unnamed(None).await, [output.clone(), stray.clone()]);
     let claim = claim_one(engine, "a").await;
     engine.finish(&claim, success(&output)).await.expect("finishes");
-    let ended = engine.get(id).await.expect("reads").expect("is there").finished_at.expect("has ended");
+    let ended = engine.get(&own(), id).await.expect("reads").expect("is there").finished_at.expect("has ended");
     assert_eq!(unnamed(None).await, std::slice::from_ref(&stray));
     assert_eq!(unnamed(Some(ended)).await, std::slice::from_ref(&stray), "it ended then, and not before");
     let later = ended.checked_add(jiff::SignedDuration::from_secs(1)).expect("a time");
     assert_eq!(unnamed(Some(later)).await, [input.hex(), output.clone(), stray.clone()]);
-    assert_eq!(engine.forget(id).await.expect("answers"), Forgotten::Gone(vec![output.clone()]), "inputs stay");
+    assert_eq!(engine.forget(&own(), id).await.expect("answers"), Forgotten::Gone(vec![output.clone()]), "inputs stay");
     assert_eq!(unnamed(None).await, [input.hex(), output.clone(), stray.clone()]);
 }
 
 async fn collect(engine: &Arc<dyn Engine>, id: JobId, after: Option<u64>) -> Vec<Event> {
-    let stream = follow(engine.clone(), id, after).await.expect("follows").expect("is there");
+    let stream = follow(engine.clone(), &own(), id, after).await.expect("follows").expect("is there");
     let all = stream.map(|event| event.expect("reads")).collect::<Vec<_>>();
     tokio::time::timeout(PATIENCE, all).await.expect("the stream ends with the job")
 }
@@ -304,7 +312,7 @@ async fn a_reader_that_comes_back_misses_nothing(engine: &Arc<dyn Engine>) {
     assert_eq!(fresh[0].data["state"], "succeeded");
     let ahead = collect(engine, id, Some(9999)).await;
     assert_eq!(ahead[0].kind, EventKind::Snapshot, "a number that was never given out starts over");
-    assert!(follow(engine.clone(), JobId::new(), None).await.expect("answers").is_none());
+    assert!(follow(engine.clone(), &own(), JobId::new(), None).await.expect("answers").is_none());
 }
 
 async fn a_waiting_worker_gets_a_job_as_it_comes(engine: &Arc<dyn Engine>) {
@@ -325,9 +333,9 @@ async fn lists_are_newest_first_paged_and_filtered(engine: &Arc<dyn Engine>) {
         ids.push(submit(engine, labeled("list", if i % 2 == 0 { "even" } else { "odd" })).await);
     }
     ids.reverse();
-    engine.request_cancel(ids[0]).await.expect("cancels");
+    engine.request_cancel(&own(), ids[0]).await.expect("cancels");
     let list = async |query: ListQuery| {
-        let page = engine.list(query).await.expect("lists");
+        let page = engine.list(&own(), query).await.expect("lists");
         (page.jobs.iter().map(|j| j.id).collect::<Vec<_>>(), page.more)
     };
     let query = ListQuery { limit: 3, ..ListQuery::default() };
@@ -342,11 +350,11 @@ async fn lists_are_newest_first_paged_and_filtered(engine: &Arc<dyn Engine>) {
         ..query.clone()
     };
     assert_eq!(list(queued).await, (vec![ids[2], ids[4]], false));
-    let job = engine.get(ids[0]).await.expect("reads").expect("is there");
+    let job = engine.get(&own(), ids[0]).await.expect("reads").expect("is there");
     let older = ListQuery { created_to: Some(job.created_at), created_from: Some(job.created_at), ..query };
     assert_eq!(list(older).await, (Vec::new(), false), "from is included, to is not");
     for id in &ids[1..] {
-        engine.request_cancel(*id).await.expect("cancels");
+        engine.request_cancel(&own(), *id).await.expect("cancels");
     }
 }
 
@@ -355,17 +363,17 @@ async fn only_an_ended_job_is_forgotten(engine: &Arc<dyn Engine>) {
     for _ in 0..2 {
         ids.push(submit(engine, new_job()).await);
         let claim = claim_one(engine, "a").await;
-        assert_eq!(engine.forget(claim.id).await.expect("answers"), Forgotten::Running);
+        assert_eq!(engine.forget(&own(), claim.id).await.expect("answers"), Forgotten::Running);
         engine.finish(&claim, success("shared")).await.expect("finishes");
     }
     assert_eq!(
-        engine.forget(ids[0]).await.expect("forgets"),
+        engine.forget(&own(), ids[0]).await.expect("forgets"),
         Forgotten::Gone(Vec::new()),
         "the other job names it too"
     );
-    assert_eq!(engine.forget(ids[1]).await.expect("forgets"), Forgotten::Gone(vec!["shared".to_owned()]));
-    assert_eq!(engine.forget(ids[1]).await.expect("answers"), Forgotten::Unknown);
-    assert_eq!(engine.get(ids[1]).await.expect("reads"), None);
+    assert_eq!(engine.forget(&own(), ids[1]).await.expect("forgets"), Forgotten::Gone(vec!["shared".to_owned()]));
+    assert_eq!(engine.forget(&own(), ids[1]).await.expect("answers"), Forgotten::Unknown);
+    assert_eq!(engine.get(&own(), ids[1]).await.expect("reads"), None);
 }
 
 async fn a_surface_is_kept_for_the_jobs_that_begin_from_it(engine: &Arc<dyn Engine>) {
@@ -377,17 +385,97 @@ async fn a_surface_is_kept_for_the_jobs_that_begin_from_it(engine: &Arc<dyn Engi
     let Work::Shrink(work) = &mut job.spec.work else { panic!("{:?}", job.spec) };
     work.warm_start = Some(WarmStartSpec { job: earlier, surface: Some(surface) });
     let later = submit(engine, job.clone()).await;
-    assert_eq!(engine.spec(later).await.expect("reads"), Some(job.spec.clone()));
-    let gone = engine.forget(earlier).await.expect("forgets");
+    assert_eq!(engine.spec(&own(), later).await.expect("reads"), Some(job.spec.clone()));
+    let gone = engine.forget(&own(), earlier).await.expect("forgets");
     assert_eq!(gone, Forgotten::Gone(Vec::new()), "a job that waits begins from it");
     let claim = claim_one(engine, "a").await;
     assert_eq!(claim.spec, job.spec, "the worker is told which blob");
     engine.finish(&claim, success("other")).await.expect("finishes");
     assert_eq!(
-        engine.get(later).await.expect("reads").expect("is there").outputs.len(),
+        engine.get(&own(), later).await.expect("reads").expect("is there").outputs.len(),
         1,
         "it is no output of its own"
     );
-    let gone = engine.forget(later).await.expect("forgets");
+    let gone = engine.forget(&own(), later).await.expect("forgets");
     assert_eq!(gone, Forgotten::Gone(vec!["other".to_owned(), surface.hex()]));
+}
+
+fn tenant(name: &str) -> Tenant {
+    name.parse().unwrap_or_else(|error| panic!("{name}: {error}"))
+}
+
+async fn another_tenants_job_is_not_there(engine: &Arc<dyn Engine>) {
+    // one name that only a dot tells from the other, and one that is the beginning of another
+    for (owner, stranger) in [("team.a", "team-a"), ("team", "team.b"), ("default", "other"), ("other", "default")] {
+        let (owner, stranger) = (tenant(owner), tenant(stranger));
+        let input = BlobId::of(owner.name().as_bytes());
+        let request = json!({"field": {"input": input.to_string()}, "labels": {"whose": owner.name()}});
+        let spec = JobSpec::from_value(&request).unwrap_or_else(|faults| panic!("refused: {faults:?}"));
+        let id = submit(engine, NewJob { tenant: owner.clone(), id: JobId::new(), spec, key: None }).await;
+        let (mut heard, mut not_heard) = (engine.changes(&owner, id), engine.changes(&stranger, id));
+        let unseen = async || {
+            assert_eq!(engine.get(&stranger, id).await.expect("answers"), None);
+            assert_eq!(engine.spec(&stranger, id).await.expect("answers"), None);
+            assert_eq!(engine.events_after(&stranger, id, 0, 10).await.expect("answers"), None);
+            assert!(follow(engine.clone(), &stranger, id, Some(0)).await.expect("answers").is_none());
+            assert_eq!(engine.request_cancel(&stranger, id).await.expect("answers"), None);
+            assert_eq!(engine.forget(&stranger, id).await.expect("answers"), Forgotten::Unknown);
+            for query in [
+                ListQuery { limit: 100, ..ListQuery::default() },
+                ListQuery {
+                    labels: vec![("whose".to_owned(), owner.name().to_owned())],
+                    limit: 9,
+                    ..ListQuery::default()
+                },
+            ] {
+                let page = engine.list(&stranger, query).await.expect("lists");
+                assert!(page.jobs.iter().all(|job| job.id != id), "{stranger} lists a job of {owner}");
+            }
+            let blobs = vec![input.hex()];
+            let unnamed = engine.unnamed(Some(&stranger), blobs.clone(), None).await.expect("answers");
+            assert_eq!(unnamed, blobs, "{stranger} names nothing");
+            assert!(engine.unnamed(Some(&owner), blobs, None).await.expect("answers").is_empty());
+        };
+        unseen().await;
+        let claim = claim_one(engine, "a").await;
+        assert_eq!((&claim.tenant, claim.id), (&owner, id), "the worker is told whose it is");
+        unseen().await;
+        assert_eq!(engine.renew(&claim, vec![progress(0.5)]).await.expect("renews"), Renewal::Keep);
+        engine.finish(&claim, success(owner.name())).await.expect("finishes");
+        unseen().await;
+        let told = tokio::time::timeout(PATIENCE, heard.next()).await.expect("the owner hears");
+        assert!(told.is_some());
+        assert!(not_heard.0.try_recv().is_err(), "nobody else does");
+        assert_eq!(engine.get(&owner, id).await.expect("reads").expect("is there").state, State::Succeeded);
+        assert_eq!(engine.spec(&owner, id).await.expect("reads").expect("is there").labels["whose"], owner.name());
+        assert_eq!(engine.forget(&owner, id).await.expect("forgets"), Forgotten::Gone(vec![owner.name().to_owned()]));
+    }
+}
+
+async fn keys_and_labels_are_each_tenants_own(engine: &Arc<dyn Engine>) {
+    let key = |fingerprint: &str| IdempotencyKey { key: "shared".to_owned(), fingerprint: fingerprint.to_owned() };
+    let tenants = [tenant("default"), tenant("key-a"), tenant("key-b")];
+    let mut jobs = Vec::new();
+    for (i, owner) in tenants.iter().enumerate() {
+        let fingerprint = format!("{i}");
+        assert_eq!(engine.recall(owner, key(&fingerprint)).await.expect("answers"), None);
+        let new = NewJob { tenant: owner.clone(), key: Some(key(&fingerprint)), ..labeled("shared", "label") };
+        let Submitted::Created(job) = engine.submit(new.clone()).await.expect("submits") else {
+            panic!("the key is new to {owner}")
+        };
+        assert_eq!(
+            engine.submit(NewJob { id: JobId::new(), ..new }).await.expect("answers"),
+            Submitted::Replayed(job.clone())
+        );
+        jobs.push(job);
+    }
+    for (i, owner) in tenants.iter().enumerate() {
+        let replayed = engine.recall(owner, key(&format!("{i}"))).await.expect("answers");
+        assert_eq!(replayed, Some(Submitted::Replayed(jobs[i].clone())));
+        assert_eq!(engine.recall(owner, key("x")).await.expect("answers"), Some(Submitted::KeyConflict));
+        let labels = vec![("shared".to_owned(), "label".to_owned())];
+        let page = engine.list(owner, ListQuery { labels, limit: 5, ..ListQuery::default() }).await.expect("lists");
+        assert_eq!(page.jobs.iter().map(|job| job.id).collect::<Vec<_>>(), [jobs[i].id]);
+        engine.request_cancel(owner, jobs[i].id).await.expect("cancels");
+    }
 }

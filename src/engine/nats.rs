@@ -18,6 +18,7 @@
 //! Do not use it for a single machine: the embedded engine needs no servers and is faster.
 
 mod address;
+mod api_keys;
 mod claims;
 mod feed;
 mod housekeeping;
@@ -34,15 +35,17 @@ mod sweeper;
 mod tests;
 
 pub use address::{Address, InvalidAddress, SCHEMES};
+pub use api_keys::NatsKeys;
 
 use super::{
     Changes, Claim, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Page,
     Renewal, Submitted, Terms, Update,
 };
 use crate::job::{Job, JobId, JobSpec, State};
+use crate::tenant::Tenant;
 use feed::Feed;
 use jiff::Timestamp;
-use layout::Layout;
+use layout::{Layout, Name};
 use ledger::{Found, Ledger, Step, Version};
 use link::{Link, failed, patiently};
 use projection::Projection;
@@ -118,24 +121,25 @@ impl Node {
     }
 
     async fn submit(&self, new: NewJob) -> Result<Submitted, EngineError> {
+        let tenant = new.tenant.clone();
         let submitted = keys::submit(&self.ledger, new).await?;
         if let Submitted::Created(job) = &submitted {
-            self.enqueue(job.id).await;
+            self.enqueue(&Name::new(&tenant, job.id)).await;
         }
         Ok(submitted)
     }
 
     /// Puts a job that waits into the queue. Where that fails a sweeper will do it, and the change that made it wait stands.
-    async fn enqueue(&self, id: JobId) {
-        let pushed = tokio::time::timeout(ENQUEUE, self.queue.push(id)).await;
+    async fn enqueue(&self, name: &Name) {
+        let pushed = tokio::time::timeout(ENQUEUE, self.queue.push(name)).await;
         let pushed = pushed.unwrap_or_else(|_| Err(EngineError::Store("no answer in time".to_owned())));
         if let Err(error) = pushed {
-            tracing::warn!(job.id = %id, %error, "a job that waits could not be put into the queue yet");
+            tracing::warn!(job.id = %name.id, %error, "a job that waits could not be put into the queue yet");
         }
     }
 
-    async fn request_cancel(&self, id: JobId) -> Result<Option<Job>, EngineError> {
-        let changed = self.ledger.change(id, None, |draft| {
+    async fn request_cancel(&self, name: &Name) -> Result<Option<Job>, EngineError> {
+        let changed = self.ledger.change(name, None, |draft| {
             match draft.record.job.state {
                 State::Queued => draft.go(State::Canceled),
                 State::Running => draft.go(State::Canceling),
@@ -153,13 +157,13 @@ impl Node {
     /// after it, the job is open now, and as long as any job is open no blob is given up. Nor is one when this node does not
     /// hear of the others. What is kept so is left to the garbage collection. Left open: a job that is submitted, run and
     /// ended with the same output within the moment from here to the removal of the blob.
-    async fn forget(&self, id: JobId) -> Result<Forgotten, EngineError> {
+    async fn forget(&self, name: &Name) -> Result<Forgotten, EngineError> {
         let (tombstone, record) = loop {
-            let Some(version) = self.ledger.version(id).await? else { return Ok(Forgotten::Unknown) };
+            let Some(version) = self.ledger.version(name).await? else { return Ok(Forgotten::Unknown) };
             if !version.record.job.state.ended() {
                 return Ok(Forgotten::Running);
             }
-            if let Some(seq) = self.ledger.forget(id, &version).await? {
+            if let Some(seq) = self.ledger.forget(name, &version).await? {
                 break (seq, version.record);
             }
         };
@@ -167,23 +171,28 @@ impl Node {
         if !hears || !self.ledger.projection.open_jobs(|_| true).is_empty() {
             return Ok(Forgotten::Gone(Vec::new()));
         }
-        self.ledger.projection.unnamed(record.named_blobs(), None).await.map(Forgotten::Gone)
+        self.ledger.projection.unnamed(None, record.named_blobs(), None).await.map(Forgotten::Gone)
     }
 
     /// Those of the blobs that no job names. Only asked once everything that was stored so far is here: a node that does not hear of
     /// the others gives up nothing. What is stored after that is about blobs that were put or touched a moment before.
-    async fn unnamed(&self, blobs: Vec<String>, expired: Option<Timestamp>) -> Result<Vec<String>, EngineError> {
+    async fn unnamed(
+        &self,
+        whose: Option<&Tenant>,
+        blobs: Vec<String>,
+        expired: Option<Timestamp>,
+    ) -> Result<Vec<String>, EngineError> {
         let info = self.ledger.layout.jobs.get_info().await.map_err(|e| failed("the jobs")(e.into()))?;
         if !self.feed.reaches(info.state.last_sequence, FORGET).await {
             return Ok(Vec::new());
         }
-        self.ledger.projection.unnamed(blobs, expired).await
+        self.ledger.projection.unnamed(whose, blobs, expired).await
     }
 
     async fn renew(&self, claim: &Claim, news: Vec<Update>) -> Result<Renewal, EngineError> {
-        let mut renewal = Renewal::Lost;
+        let (mut renewal, name) = (Renewal::Lost, name(claim));
         for news in together(news) {
-            let renewed = self.ledger.change(claim.id, self.seen(claim), |draft| {
+            let renewed = self.ledger.change(&name, self.seen(claim), |draft| {
                 let standing = draft.record.standing(claim);
                 if standing == Renewal::Lost {
                     return Step::Leave(standing);
@@ -201,7 +210,8 @@ impl Node {
     }
 
     async fn finish(&self, claim: &Claim, outcome: Outcome) -> Result<(), EngineError> {
-        let ended = self.ledger.change(claim.id, self.seen(claim), |draft| {
+        let name = name(claim);
+        let ended = self.ledger.change(&name, self.seen(claim), |draft| {
             let standing = draft.record.standing(claim);
             if standing == Renewal::Lost {
                 return Step::Leave(false);
@@ -212,7 +222,7 @@ impl Node {
         match ended.await? {
             Some((true, record)) => {
                 if record.job.state == State::Queued {
-                    self.enqueue(claim.id).await;
+                    self.enqueue(&name).await;
                 }
                 Ok(())
             }
@@ -223,29 +233,29 @@ impl Node {
     async fn standing(&self, claim: &Claim) -> Result<Renewal, EngineError> {
         let version = match self.seen(claim) {
             Some(version) => Some(version),
-            None => self.ledger.version(claim.id).await?,
+            None => self.ledger.version(&name(claim)).await?,
         };
         Ok(version.map_or(Renewal::Lost, |version| version.record.standing(claim)))
     }
 
-    async fn events_after(&self, id: JobId, after: u64, limit: usize) -> Result<Option<EventPage>, EngineError> {
+    async fn events_after(&self, name: &Name, after: u64, limit: usize) -> Result<Option<EventPage>, EngineError> {
         let projection = &self.ledger.projection;
-        let mut found = projection.events_after(id, after, limit).await?;
+        let mut found = projection.events_after(name, after, limit).await?;
         // another node may have told more than has come here
         if found.as_ref().is_none_or(|(page, _)| after > page.newest) {
-            if self.ledger.version(id).await?.is_none() {
+            if self.ledger.version(name).await?.is_none() {
                 return Ok(None);
             }
-            found = projection.events_after(id, after, limit).await?;
+            found = projection.events_after(name, after, limit).await?;
         }
         let Some((page, whole)) = found else { return Ok(None) };
         let is_here = after >= page.newest || (page.oldest > 0 && after + 1 >= page.oldest);
         if whole || is_here {
             return Ok(Some(page));
         }
-        let (events, seq) = feed::history(&self.ledger, id).await?;
-        projection.complete(id, events, seq).await?;
-        Ok(projection.events_after(id, after, limit).await?.map(|(page, _)| page))
+        let (events, seq) = feed::history(&self.ledger, name).await?;
+        projection.complete(name.id, events, seq).await?;
+        Ok(projection.events_after(name, after, limit).await?.map(|(page, _)| page))
     }
 
     async fn health(&self) -> Result<(), EngineError> {
@@ -258,6 +268,11 @@ impl Node {
         }
         Ok(())
     }
+}
+
+/// The job that a claim holds.
+fn name(claim: &Claim) -> Name {
+    Name::new(&claim.tenant, claim.id)
 }
 
 /// News in portions that fit into one message each; one portion when there are none.
@@ -283,38 +298,43 @@ impl Engine for NatsEngine {
         patiently(self.node.submit(job)).await
     }
 
-    async fn recall(&self, key: IdempotencyKey) -> Result<Option<Submitted>, EngineError> {
-        patiently(keys::recall(&self.node.ledger, &key)).await
+    async fn recall(&self, tenant: &Tenant, key: IdempotencyKey) -> Result<Option<Submitted>, EngineError> {
+        patiently(keys::recall(&self.node.ledger, tenant, &key)).await
     }
 
-    async fn get(&self, id: JobId) -> Result<Option<Job>, EngineError> {
-        let found = patiently(self.node.ledger.read(id)).await?;
+    async fn get(&self, tenant: &Tenant, id: JobId) -> Result<Option<Job>, EngineError> {
+        let found = patiently(self.node.ledger.read(&Name::new(tenant, id))).await?;
         Ok(match found {
             Found::Job(version) => Some(version.record.job.clone()),
             Found::Forgotten | Found::Nothing => None,
         })
     }
 
-    async fn spec(&self, id: JobId) -> Result<Option<JobSpec>, EngineError> {
-        let stored = patiently(self.node.ledger.request(id)).await?;
+    async fn spec(&self, tenant: &Tenant, id: JobId) -> Result<Option<JobSpec>, EngineError> {
+        let stored = patiently(self.node.ledger.request(&Name::new(tenant, id))).await?;
         let read = |value| JobSpec::from_value(&value).map_err(|faults| EngineError::Store(format!("{faults:?}")));
         stored.map(read).transpose()
     }
 
-    async fn list(&self, query: ListQuery) -> Result<Page, EngineError> {
-        self.node.ledger.projection.list(query).await
+    async fn list(&self, tenant: &Tenant, query: ListQuery) -> Result<Page, EngineError> {
+        self.node.ledger.projection.list(tenant, query).await
     }
 
-    async fn request_cancel(&self, id: JobId) -> Result<Option<Job>, EngineError> {
-        patiently(self.node.request_cancel(id)).await
+    async fn request_cancel(&self, tenant: &Tenant, id: JobId) -> Result<Option<Job>, EngineError> {
+        patiently(self.node.request_cancel(&Name::new(tenant, id))).await
     }
 
-    async fn forget(&self, id: JobId) -> Result<Forgotten, EngineError> {
-        patiently(self.node.forget(id)).await
+    async fn forget(&self, tenant: &Tenant, id: JobId) -> Result<Forgotten, EngineError> {
+        patiently(self.node.forget(&Name::new(tenant, id))).await
     }
 
-    async fn unnamed(&self, blobs: Vec<String>, expired: Option<Timestamp>) -> Result<Vec<String>, EngineError> {
-        patiently(self.node.unnamed(blobs, expired)).await
+    async fn unnamed(
+        &self,
+        whose: Option<&Tenant>,
+        blobs: Vec<String>,
+        expired: Option<Timestamp>,
+    ) -> Result<Vec<String>, EngineError> {
+        patiently(self.node.unnamed(whose, blobs, expired)).await
     }
 
     async fn claim(&self, worker: &str, slots: usize, wait: Duration) -> Result<Vec<Claim>, EngineError> {
@@ -326,7 +346,7 @@ impl Engine for NatsEngine {
     }
 
     async fn interrupted(&self, claim: &Claim) -> Renewal {
-        let mut changes = self.changes(claim.id);
+        let mut changes = self.changes(&claim.tenant, claim.id);
         loop {
             match patiently(self.node.standing(claim)).await {
                 Ok(Renewal::Keep) => {}
@@ -342,12 +362,18 @@ impl Engine for NatsEngine {
         patiently(self.node.finish(claim, outcome)).await
     }
 
-    async fn events_after(&self, id: JobId, after: u64, limit: usize) -> Result<Option<EventPage>, EngineError> {
-        patiently(self.node.events_after(id, after, limit)).await
+    async fn events_after(
+        &self,
+        tenant: &Tenant,
+        id: JobId,
+        after: u64,
+        limit: usize,
+    ) -> Result<Option<EventPage>, EngineError> {
+        patiently(self.node.events_after(&Name::new(tenant, id), after, limit)).await
     }
 
-    fn changes(&self, id: JobId) -> Changes {
-        Changes(self.node.ledger.projection.subscribe(id))
+    fn changes(&self, tenant: &Tenant, id: JobId) -> Changes {
+        Changes(self.node.ledger.projection.subscribe(tenant, id))
     }
 
     async fn health(&self) -> Result<(), EngineError> {

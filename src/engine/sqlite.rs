@@ -16,6 +16,7 @@ use super::{
     Renewal, Submitted, Terms, Update,
 };
 use crate::job::{Failure, Job, JobId, JobSpec, State};
+use crate::tenant::Tenant;
 use jiff::Timestamp;
 use records::{Change, Ctx};
 use rusqlite::{Connection, OptionalExtension, params};
@@ -110,40 +111,46 @@ impl Engine for SqliteEngine {
         Ok(submitted)
     }
 
-    async fn recall(&self, key: IdempotencyKey) -> Result<Option<Submitted>, EngineError> {
-        self.write(move |ctx| recall(ctx, &key)).await
+    async fn recall(&self, tenant: &Tenant, key: IdempotencyKey) -> Result<Option<Submitted>, EngineError> {
+        let tenant = tenant.clone();
+        self.write(move |ctx| recall(ctx, &tenant, &key)).await
     }
 
-    async fn get(&self, id: JobId) -> Result<Option<Job>, EngineError> {
-        self.read(move |c| records::read(c, id)).await
+    async fn get(&self, tenant: &Tenant, id: JobId) -> Result<Option<Job>, EngineError> {
+        let tenant = tenant.clone();
+        self.read(move |c| records::read(c, &tenant, id)).await
     }
 
-    async fn spec(&self, id: JobId) -> Result<Option<JobSpec>, EngineError> {
-        let stored = self.read(move |c| records::spec(c, id)).await?;
+    async fn spec(&self, tenant: &Tenant, id: JobId) -> Result<Option<JobSpec>, EngineError> {
+        let tenant = tenant.clone();
+        let stored = self.read(move |c| records::spec(c, &tenant, id)).await?;
         let read = |value| JobSpec::from_value(&value).map_err(|faults| EngineError::Store(format!("{faults:?}")));
         stored.map(read).transpose()
     }
 
-    async fn list(&self, query: ListQuery) -> Result<Page, EngineError> {
-        self.read(move |c| records::list(c, &query)).await
+    async fn list(&self, tenant: &Tenant, query: ListQuery) -> Result<Page, EngineError> {
+        let tenant = tenant.clone();
+        self.read(move |c| records::list(c, &tenant, &query)).await
     }
 
-    async fn request_cancel(&self, id: JobId) -> Result<Option<Job>, EngineError> {
+    async fn request_cancel(&self, tenant: &Tenant, id: JobId) -> Result<Option<Job>, EngineError> {
+        let tenant = tenant.clone();
         self.write(move |ctx| {
-            let Some(job) = records::read(ctx.connection, id)? else { return Ok(None) };
+            let Some(job) = records::read(ctx.connection, &tenant, id)? else { return Ok(None) };
             match job.state {
                 State::Queued => records::change(ctx, id, Change::to(State::Canceled))?,
                 State::Running => records::change(ctx, id, Change::to(State::Canceling))?,
                 _ => return Ok(Some(job)),
             }
-            records::read(ctx.connection, id)
+            records::read(ctx.connection, &tenant, id)
         })
         .await
     }
 
-    async fn forget(&self, id: JobId) -> Result<Forgotten, EngineError> {
+    async fn forget(&self, tenant: &Tenant, id: JobId) -> Result<Forgotten, EngineError> {
+        let tenant = tenant.clone();
         self.write(move |ctx| {
-            let Some(job) = records::read(ctx.connection, id)? else { return Ok(Forgotten::Unknown) };
+            let Some(job) = records::read(ctx.connection, &tenant, id)? else { return Ok(Forgotten::Unknown) };
             if !job.state.ended() {
                 return Ok(Forgotten::Running);
             }
@@ -161,8 +168,14 @@ impl Engine for SqliteEngine {
         .await
     }
 
-    async fn unnamed(&self, blobs: Vec<String>, expired: Option<Timestamp>) -> Result<Vec<String>, EngineError> {
-        self.read(move |c| records::unnamed(c, blobs, expired)).await
+    async fn unnamed(
+        &self,
+        whose: Option<&Tenant>,
+        blobs: Vec<String>,
+        expired: Option<Timestamp>,
+    ) -> Result<Vec<String>, EngineError> {
+        let whose = whose.cloned();
+        self.read(move |c| records::unnamed(c, whose.as_ref(), blobs, expired)).await
     }
 
     async fn claim(&self, worker: &str, slots: usize, wait: Duration) -> Result<Vec<Claim>, EngineError> {
@@ -197,7 +210,7 @@ impl Engine for SqliteEngine {
     }
 
     async fn interrupted(&self, claim: &Claim) -> Renewal {
-        let mut changes = self.changes(claim.id);
+        let mut changes = self.changes(&claim.tenant, claim.id);
         loop {
             let of = claim.clone();
             match self.read(move |c| records::standing(c, &of)).await {
@@ -243,12 +256,19 @@ impl Engine for SqliteEngine {
         Ok(())
     }
 
-    async fn events_after(&self, id: JobId, after: u64, limit: usize) -> Result<Option<EventPage>, EngineError> {
-        self.read(move |c| records::events_after(c, id, after, limit)).await
+    async fn events_after(
+        &self,
+        tenant: &Tenant,
+        id: JobId,
+        after: u64,
+        limit: usize,
+    ) -> Result<Option<EventPage>, EngineError> {
+        let tenant = tenant.clone();
+        self.read(move |c| records::events_after(c, &tenant, id, after, limit)).await
     }
 
-    fn changes(&self, id: JobId) -> Changes {
-        Changes(self.hub.subscribe(id))
+    fn changes(&self, tenant: &Tenant, id: JobId) -> Changes {
+        Changes(self.hub.subscribe(tenant, id))
     }
 
     async fn health(&self) -> Result<(), EngineError> {
@@ -257,11 +277,12 @@ impl Engine for SqliteEngine {
 }
 
 /// The answer to an earlier submit with this key.
-fn recall(ctx: &mut Ctx<'_>, key: &IdempotencyKey) -> rusqlite::Result<Option<Submitted>> {
+fn recall(ctx: &mut Ctx<'_>, tenant: &Tenant, key: &IdempotencyKey) -> rusqlite::Result<Option<Submitted>> {
     ctx.connection.execute("DELETE FROM idempotency WHERE expires_at <= ?1", [ctx.now])?;
-    let known = "SELECT fingerprint, answer FROM idempotency WHERE key = ?1";
+    let known = "SELECT fingerprint, answer FROM idempotency WHERE tenant = ?1 AND key = ?2";
     let row = |row: &rusqlite::Row<'_>| Ok((row.get::<_, String>(0)?, row.get::<_, String>(1)?));
-    let Some((fingerprint, answer)) = ctx.connection.query_row(known, [&key.key], row).optional()? else {
+    let Some((fingerprint, answer)) = ctx.connection.query_row(known, [tenant.name(), &key.key], row).optional()?
+    else {
         return Ok(None);
     };
     if fingerprint != key.fingerprint {
@@ -272,16 +293,16 @@ fn recall(ctx: &mut Ctx<'_>, key: &IdempotencyKey) -> rusqlite::Result<Option<Su
 
 fn submit(ctx: &mut Ctx<'_>, new: &NewJob) -> rusqlite::Result<Submitted> {
     if let Some(key) = &new.key
-        && let Some(answer) = recall(ctx, key)?
+        && let Some(answer) = recall(ctx, &new.tenant, key)?
     {
         return Ok(answer);
     }
     records::insert(ctx, new)?;
-    let job = records::read(ctx.connection, new.id)?.ok_or(rusqlite::Error::QueryReturnedNoRows)?;
+    let job = records::read(ctx.connection, &new.tenant, new.id)?.ok_or(rusqlite::Error::QueryReturnedNoRows)?;
     if let Some(key) = &new.key {
         ctx.connection.execute(
-            "INSERT INTO idempotency (key, fingerprint, answer, expires_at) VALUES (?1, ?2, ?3, ?4)",
-            params![key.key, key.fingerprint, records::to_json(&job)?, ctx.now + KEY_LIFETIME_MS],
+            "INSERT INTO idempotency (tenant, key, fingerprint, answer, expires_at) VALUES (?1, ?2, ?3, ?4, ?5)",
+            params![new.tenant.name(), key.key, key.fingerprint, records::to_json(&job)?, ctx.now + KEY_LIFETIME_MS],
         )?;
     }
     Ok(Submitted::Created(job))
@@ -295,17 +316,18 @@ fn claim(ctx: &mut Ctx<'_>, worker: &str, slots: usize, terms: Terms) -> rusqlit
         let take = "UPDATE jobs SET state = 'running', attempt = attempt + 1, revision = revision + 1, worker = ?1,
                         lease_until = ?2, started_at = COALESCE(started_at, ?3), progress = NULL
                     WHERE id = (SELECT id FROM jobs WHERE state = 'queued' ORDER BY id LIMIT 1)
-                    RETURNING id, attempt, spec";
+                    RETURNING id, attempt, spec, tenant";
         let taken = ctx.connection.query_row(take, params![worker, until, ctx.now], |row| {
-            Ok((row.get::<_, String>(0)?, row.get::<_, u32>(1)?, row.get::<_, String>(2)?))
+            Ok((row.get::<_, String>(0)?, row.get::<_, u32>(1)?, row.get::<_, String>(2)?, row.get::<_, String>(3)?))
         });
-        let Some((id, attempt, spec)) = taken.optional()? else { break };
+        let Some((id, attempt, spec, tenant)) = taken.optional()? else { break };
         let id: JobId = id.parse().map_err(records::corrupt)?;
+        let tenant: Tenant = tenant.parse().map_err(records::corrupt)?;
         let spec: serde_json::Value = records::from_json(&spec)?;
         match JobSpec::from_value(&spec) {
             Ok(spec) => {
                 records::tell_state(ctx, id)?;
-                claims.push(Claim { id, attempt, spec, worker: worker.to_owned(), lease: terms.lease });
+                claims.push(Claim { tenant, id, attempt, spec, worker: worker.to_owned(), lease: terms.lease });
             }
             // accepted by another version that knew more
             Err(faults) => {
@@ -352,7 +374,7 @@ mod tests {
         assert_eq!(first.len(), 1);
         drop(engine);
         let engine = open(folder.path(), Terms::default());
-        assert_eq!(engine.get(id).await.expect("reads").map(|j| j.state), Some(State::Queued));
+        assert_eq!(engine.get(&Tenant::default(), id).await.expect("reads").map(|j| j.state), Some(State::Queued));
         let again = engine.claim("b", 1, Duration::ZERO).await.expect("claims");
         assert_eq!(again[0].attempt, 2);
         assert!(matches!(engine.finish(&first[0], Outcome::Canceled).await, Err(EngineError::Fenced { .. })));

@@ -2,8 +2,10 @@
 
 use super::jobs::job_id;
 use super::{App, Problem, query};
+use crate::auth::{Caller, Scope};
 use crate::engine;
 use crate::job::{Event, JobId};
+use crate::tenant::Tenant;
 use axum::Json;
 use axum::extract::{Path, RawQuery, State};
 use axum::http::{HeaderMap, HeaderName, StatusCode, header};
@@ -61,10 +63,12 @@ pub struct EventsPage {
 )]
 pub async fn events(
     State(app): State<App>,
+    caller: Caller,
     Path(id): Path<String>,
     RawQuery(raw): RawQuery,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
+    let tenant = caller.may(Scope::Read)?;
     let parameters = query::parameters(raw.as_deref(), &["after", "limit"], &[])?;
     let limit = query::number(&parameters, "limit")?.unwrap_or(DEFAULT_LIMIT);
     if !(1..=MAX_LIMIT).contains(&limit) {
@@ -73,13 +77,13 @@ pub async fn events(
     let after = last_event_id(&headers)?.or(query::number(&parameters, "after")?);
     let id = job_id(&id)?;
     match wanted(&headers)? {
-        Form::Stream => stream(app, id, after).await,
-        Form::Page => page(&app, id, after.unwrap_or(0), limit as usize).await,
+        Form::Stream => stream(app, tenant, id, after).await,
+        Form::Page => page(&app, tenant, id, after.unwrap_or(0), limit as usize).await,
     }
 }
 
-async fn page(app: &App, id: JobId, after: u64, limit: usize) -> Result<Response, Problem> {
-    let page = app.engine.events_after(id, after, limit).await?;
+async fn page(app: &App, tenant: &Tenant, id: JobId, after: u64, limit: usize) -> Result<Response, Problem> {
+    let page = app.engine.events_after(tenant, id, after, limit).await?;
     let page = page.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
     let next_after = page.events.last().map_or(after, |event| event.seq);
     let ended = page.job.state.ended();
@@ -87,15 +91,15 @@ async fn page(app: &App, id: JobId, after: u64, limit: usize) -> Result<Response
     Ok(([(header::CACHE_CONTROL, "no-cache")], Json(body)).into_response())
 }
 
-async fn stream(app: App, id: JobId, after: Option<u64>) -> Result<Response, Problem> {
+async fn stream(app: App, tenant: &Tenant, id: JobId, after: Option<u64>) -> Result<Response, Problem> {
     let unknown = || Problem::unknown_job(&id.to_string());
     if let Some(after) = after {
-        let seen = app.engine.events_after(id, after, 1).await?.ok_or_else(unknown)?;
+        let seen = app.engine.events_after(tenant, id, after, 1).await?.ok_or_else(unknown)?;
         if seen.job.state.ended() && after == seen.newest {
             return Ok(StatusCode::NO_CONTENT.into_response());
         }
     }
-    let events = engine::follow(app.engine, id, after).await?.ok_or_else(unknown)?;
+    let events = engine::follow(app.engine, tenant, id, after).await?.ok_or_else(unknown)?;
     let frames = events.enumerate().map(move |(i, event)| {
         let event = event.inspect_err(|error| tracing::error!(job.id = %id, %error, "a stream broke off"))?;
         let frame =

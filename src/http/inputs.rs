@@ -1,11 +1,13 @@
 //! `/v1/inputs`: bytes that jobs name by their hash.
 
 use super::{App, Problem, body, query};
+use crate::auth::{Caller, Scope};
 use crate::blobs::BlobId;
 use crate::field::FieldError;
 use crate::field::input::{Description, FieldOptions};
 use crate::field::network::family::Family;
 use crate::job::{Failure, pipeline, spec};
+use crate::tenant::Tenant;
 use axum::Json;
 use axum::body::Body;
 use axum::extract::{Path, RawQuery, State};
@@ -27,7 +29,7 @@ pub struct Input {
     id: BlobId,
     /// Its size.
     bytes: u64,
-    /// When it was first uploaded.
+    /// When its tenant first uploaded it.
     #[schema(value_type = String, format = DateTime)]
     created_at: Timestamp,
     /// What the upload said of how to read it.
@@ -94,12 +96,18 @@ fn says_nothing(options: &FieldOptions) -> bool {
         (status = 503, description = "the service is stopping"),
     )
 )]
-pub async fn upload(State(app): State<App>, RawQuery(raw): RawQuery, body: Body) -> Result<Response, Problem> {
+pub async fn upload(
+    State(app): State<App>,
+    caller: Caller,
+    RawQuery(raw): RawQuery,
+    body: Body,
+) -> Result<Response, Problem> {
+    let tenant = caller.may(Scope::Write)?;
     let options = reading_options(raw.as_deref())?;
     let bytes = body::read(body, app.limits.input_bytes).await?;
     let hashed = bytes.clone();
     let id = tokio::task::spawn_blocking(move || BlobId::of(&hashed)).await.map_err(joined)?;
-    if let Some(mut known) = known(&app, id).await? {
+    if let Some(mut known) = known(&app, tenant, id).await? {
         // the note keeps what the first upload said: an answer depends on its own request alone
         if known.options != options {
             known = Input { description: described(bytes, options.clone()).await?, options, ..known };
@@ -109,21 +117,21 @@ pub async fn upload(State(app): State<App>, RawQuery(raw): RawQuery, body: Body)
     let description = described(bytes.clone(), options.clone()).await?;
     let input = Input { id, bytes: bytes.len() as u64, created_at: Timestamp::now(), options, description };
     let _promise = app.blobs.promise().await;
-    app.blobs.put(bytes).await?;
+    app.blobs.put_unseen(bytes).await?;
     // the note comes last: an input that is known is complete
     let note = serde_json::to_vec(&input).map_err(|_| Problem::internal())?;
-    app.blobs.put_note(id, note.into()).await?;
+    app.blobs.put_note(tenant, id, note.into()).await?;
     let location = HeaderValue::from_str(&format!("/v1/inputs/{id}")).map_err(|_| Problem::internal())?;
     Ok((StatusCode::CREATED, [(header::LOCATION, location)], Json(input)).into_response())
 }
 
 /// The input, if it is there already; from now on it is kept as one that was just uploaded.
-async fn known(app: &App, id: BlobId) -> Result<Option<Input>, Problem> {
+async fn known(app: &App, tenant: &Tenant, id: BlobId) -> Result<Option<Input>, Problem> {
     let _promise = app.blobs.promise().await;
-    if !app.blobs.touch(id).await? {
+    if !app.blobs.touch(tenant, id).await? {
         return Ok(None);
     }
-    app.blobs.note(id).await?.map(|note| read_note(&note)).transpose()
+    app.blobs.note(tenant, id).await?.map(|note| read_note(&note)).transpose()
 }
 
 /// What the query says of how to read the file. A value that is no JSON is a name.
@@ -165,13 +173,16 @@ async fn described(bytes: Bytes, options: FieldOptions) -> Result<Description, P
 )]
 pub async fn describe(
     State(app): State<App>,
+    caller: Caller,
     Path(id): Path<String>,
     RawQuery(raw): RawQuery,
 ) -> Result<Json<Input>, Problem> {
+    let tenant = caller.may(Scope::Read)?;
     query::parameters(raw.as_deref(), &[], &[])?;
     let unknown =
         || Problem::not_found("unknown_input", "there is no such input", format!("no input {id:?} is stored"));
-    let note = app.blobs.note(id.parse().map_err(|_| unknown())?).await?.ok_or_else(unknown)?;
+    let parsed = id.parse().map_err(|_| unknown())?;
+    let note = app.blobs.note(tenant, parsed).await?.ok_or_else(unknown)?;
     Ok(Json(read_note(&note)?))
 }
 

@@ -5,12 +5,14 @@ mod warm_start;
 
 use super::inputs::{self, Input};
 use super::{App, Problem, body, conditional, query};
+use crate::auth::{Caller, Scope};
 use crate::blobs::BlobId;
 use crate::engine::{Forgotten, IdempotencyKey, NewJob, Submitted};
 use crate::field::{Fault, FieldError};
 use crate::job::spec::{FieldSpec, Fitting, Work};
 use crate::job::{Failure, Job, JobId, JobKind, JobSpec, OutputName, pipeline};
 use crate::shrink::Method;
+use crate::tenant::Tenant;
 use axum::Json;
 use axum::body::Body;
 use axum::extract::{Path, RawQuery, State};
@@ -73,10 +75,12 @@ pub struct Estimate {
 )]
 pub async fn submit(
     State(app): State<App>,
+    caller: Caller,
     RawQuery(raw): RawQuery,
     headers: HeaderMap,
     body: Body,
 ) -> Result<Response, Problem> {
+    let tenant = caller.may(Scope::Write)?;
     let parameters = query::parameters(raw.as_deref(), &["validate_only"], &[])?;
     let validate_only = query::flag(&parameters, "validate_only")?;
     let key = idempotency_key(&headers)?;
@@ -92,16 +96,16 @@ pub async fn submit(
     let key = key.map(|key| IdempotencyKey { key, fingerprint });
     // a repeated request has its answer, also when what it named is gone by now
     if let Some(key) = key.as_ref().filter(|_| !validate_only)
-        && let Some(answer) = app.engine.recall(key.clone()).await?
+        && let Some(answer) = app.engine.recall(tenant, key.clone()).await?
     {
-        return answer_submit(&app, &headers, answer).await;
+        return answer_submit(&app, tenant, &headers, answer).await;
     }
     // no blob goes from the moment that it is looked up until the new job's record names it
     let promise = app.blobs.promise().await;
-    let dimension = check_fields(&app, &spec).await?;
+    let dimension = check_fields(&app, tenant, &spec).await?;
     let mut spec = spec.for_dimension(dimension, &request).map_err(|faults| Problem::invalid_request("", &faults))?;
     if matches!(&spec.work, Work::Shrink(work) if work.warm_start.is_some()) {
-        warm_start::resolve(&app, &mut spec).await?;
+        warm_start::resolve(&app, tenant, &mut spec).await?;
     }
     if validate_only {
         return Ok(Json(estimate(&spec, dimension)).into_response());
@@ -109,13 +113,18 @@ pub async fn submit(
     if app.stop.is_cancelled() {
         return Err(Problem::unavailable("stopping", "the service is stopping"));
     }
-    let submitted = app.engine.submit(NewJob { id: JobId::new(), spec, key }).await?;
+    let submitted = app.engine.submit(NewJob { tenant: tenant.clone(), id: JobId::new(), spec, key }).await?;
     drop(promise);
-    answer_submit(&app, &headers, submitted).await
+    answer_submit(&app, tenant, &headers, submitted).await
 }
 
 /// The answer to a submit, after the wait that `Prefer` asks for.
-async fn answer_submit(app: &App, headers: &HeaderMap, submitted: Submitted) -> Result<Response, Problem> {
+async fn answer_submit(
+    app: &App,
+    tenant: &Tenant,
+    headers: &HeaderMap,
+    submitted: Submitted,
+) -> Result<Response, Problem> {
     let (mut job, replayed) = match submitted {
         Submitted::Created(job) => (job, false),
         Submitted::Replayed(job) => (job, true),
@@ -140,7 +149,7 @@ async fn answer_submit(app: &App, headers: &HeaderMap, submitted: Submitted) -> 
         answer.insert(HeaderName::from_static("idempotent-replayed"), HeaderValue::from_static("true"));
     }
     if let Some(wait) = query::prefer_wait(headers) {
-        job = wait_until(app, job.id, wait, |job| job.state.ended()).await?.unwrap_or(job);
+        job = wait_until(app, tenant, job.id, wait, |job| job.state.ended()).await?.unwrap_or(job);
         let applied = HeaderValue::from_str(&format!("wait={}", wait.as_secs())).map_err(|_| Problem::internal())?;
         answer.insert(HeaderName::from_static("preference-applied"), applied);
     }
@@ -172,17 +181,20 @@ async fn answer_submit(app: &App, headers: &HeaderMap, submitted: Submitted) -> 
 )]
 pub async fn get(
     State(app): State<App>,
+    caller: Caller,
     Path(id): Path<String>,
     RawQuery(raw): RawQuery,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
+    let tenant = caller.may(Scope::Read)?;
     let parameters = query::parameters(raw.as_deref(), &["wait"], &[])?;
     let wait = query::wait(&parameters)?.unwrap_or_default();
     let id = job_id(&id)?;
     let known = |job: &Job| conditional::names_tag(&headers, header::IF_NONE_MATCH, &tag(job));
     let conditional = headers.contains_key(header::IF_NONE_MATCH);
     let news = |job: &Job| if conditional { !known(job) } else { job.state.ended() };
-    let job = wait_until(&app, id, wait, news).await?.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
+    let job = wait_until(&app, tenant, id, wait, news).await?;
+    let job = job.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
     if known(&job) {
         let answer = [(header::ETAG, tag(&job)), (header::CACHE_CONTROL, "no-cache".to_owned())];
         return Ok((StatusCode::NOT_MODIFIED, answer).into_response());
@@ -207,12 +219,15 @@ pub async fn get(
 )]
 pub async fn cancel(
     State(app): State<App>,
+    caller: Caller,
     Path(id): Path<String>,
     RawQuery(raw): RawQuery,
 ) -> Result<Response, Problem> {
+    let tenant = caller.may(Scope::Write)?;
     query::parameters(raw.as_deref(), &[], &[])?;
     let id = job_id(&id)?;
-    let job = app.engine.request_cancel(id).await?.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
+    let job = app.engine.request_cancel(tenant, id).await?;
+    let job = job.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
     tracing::info!(job.id = %id, job.state = job.state.name(), "cancel requested");
     let status = if job.state.ended() { StatusCode::OK } else { StatusCode::ACCEPTED };
     Ok((status, job_answer(job)).into_response())
@@ -233,19 +248,21 @@ pub async fn cancel(
 )]
 pub async fn forget(
     State(app): State<App>,
+    caller: Caller,
     Path(id): Path<String>,
     RawQuery(raw): RawQuery,
 ) -> Result<StatusCode, Problem> {
+    let tenant = caller.may(Scope::Write)?;
     query::parameters(raw.as_deref(), &[], &[])?;
     let id = job_id(&id)?;
     // no job may come to name a blob between the two steps
     let _sweep = app.blobs.sweep().await;
-    match app.engine.forget(id).await? {
+    match app.engine.forget(tenant, id).await? {
         Forgotten::Gone(unused) => {
             for blob in unused.iter().filter_map(|hex| BlobId::from_hex(hex)) {
                 app.blobs.remove(blob).await?;
             }
-            app.blobs.remove_checkpoint(&id.to_string()).await?;
+            app.blobs.remove_checkpoint(tenant, &id.to_string()).await?;
             tracing::info!(job.id = %id, "job forgotten");
             Ok(StatusCode::NO_CONTENT)
         }
@@ -281,11 +298,17 @@ fn tag(job: &Job) -> String {
 }
 
 /// The job once `done` says so, and at the latest after `wait` or when the service stops. `None` when there is no such job.
-async fn wait_until(app: &App, id: JobId, wait: Duration, done: impl Fn(&Job) -> bool) -> Result<Option<Job>, Problem> {
+async fn wait_until(
+    app: &App,
+    tenant: &Tenant,
+    id: JobId,
+    wait: Duration,
+    done: impl Fn(&Job) -> bool,
+) -> Result<Option<Job>, Problem> {
     let deadline = tokio::time::Instant::now() + wait;
-    let mut changes = (!wait.is_zero()).then(|| app.engine.changes(id));
+    let mut changes = (!wait.is_zero()).then(|| app.engine.changes(tenant, id));
     loop {
-        let Some(job) = app.engine.get(id).await? else { return Ok(None) };
+        let Some(job) = app.engine.get(tenant, id).await? else { return Ok(None) };
         let Some(changes) = changes.as_mut().filter(|_| !done(&job)) else { return Ok(Some(job)) };
         tokio::select! {
             _ = changes.next() => {}
@@ -306,19 +329,19 @@ fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, Problem> {
 }
 
 /// Checks what the field and the weight name. Tells the field's dimension.
-async fn check_fields(app: &App, spec: &JobSpec) -> Result<u8, Problem> {
+async fn check_fields(app: &App, tenant: &Tenant, spec: &JobSpec) -> Result<u8, Problem> {
     let work = match &spec.work {
         Work::Shrink(work) => work,
         Work::Fit(fitting) => {
-            check_meshes(app, &fitting.meshes).await?;
+            check_meshes(app, tenant, &fitting.meshes).await?;
             return Ok(3);
         }
         Work::Sensitivity(_) => return Ok(3),
     };
-    let dimension = check_field(app, &work.field, "/field").await?;
+    let dimension = check_field(app, tenant, &work.field, "/field").await?;
     if work.latent_motion {
         let input = match work.field.input {
-            Some(id) => Some(described(app, id, "/field/input").await?),
+            Some(id) => Some(described(app, tenant, id, "/field/input").await?),
             None => None,
         };
         if !input.is_some_and(|input| input.has_latent_code()) {
@@ -328,7 +351,7 @@ async fn check_fields(app: &App, spec: &JobSpec) -> Result<u8, Problem> {
         }
     }
     if let Some(weight) = &work.weight
-        && check_field(app, weight, "/weight").await? != 3
+        && check_field(app, tenant, weight, "/weight").await? != 3
     {
         let detail = "a weight is a field of dimension 3".to_owned();
         let fault = Fault { pointer: "/weight".to_owned(), code: "dimension", detail };
@@ -344,8 +367,8 @@ fn surface_blob(job: &Job) -> Option<BlobId> {
 }
 
 /// What an input holds that is about to be named at `pointer`.
-async fn described(app: &App, id: BlobId, pointer: &str) -> Result<Input, Problem> {
-    let note = if app.blobs.touch(id).await? { app.blobs.note(id).await? } else { None };
+async fn described(app: &App, tenant: &Tenant, id: BlobId, pointer: &str) -> Result<Input, Problem> {
+    let note = if app.blobs.touch(tenant, id).await? { app.blobs.note(tenant, id).await? } else { None };
     let Some(note) = note else {
         let detail = format!("no input {id} is stored; upload it to /v1/inputs first");
         let fault = Fault { pointer: pointer.to_owned(), code: "unknown_input", detail };
@@ -355,10 +378,10 @@ async fn described(app: &App, id: BlobId, pointer: &str) -> Result<Input, Proble
 }
 
 /// Checks that the inputs which a fit names are there, and meshes.
-async fn check_meshes(app: &App, meshes: &[BlobId]) -> Result<(), Problem> {
+async fn check_meshes(app: &App, tenant: &Tenant, meshes: &[BlobId]) -> Result<(), Problem> {
     for (i, &id) in meshes.iter().enumerate() {
         let pointer = format!("/meshes/{i}");
-        if !described(app, id, &pointer).await?.is_mesh() {
+        if !described(app, tenant, id, &pointer).await?.is_mesh() {
             let detail = format!("{id} is no mesh, and a network is fitted to meshes");
             return Err(Problem::invalid_request("", &[Fault { pointer, code: "not_a_mesh", detail }]));
         }
@@ -367,9 +390,9 @@ async fn check_meshes(app: &App, meshes: &[BlobId]) -> Result<(), Problem> {
 }
 
 /// Checks what a field names, at `pointer`: the scene in the request, or the input that must be there. Tells its dimension.
-async fn check_field(app: &App, field: &FieldSpec, pointer: &'static str) -> Result<u8, Problem> {
+async fn check_field(app: &App, tenant: &Tenant, field: &FieldSpec, pointer: &'static str) -> Result<u8, Problem> {
     if let Some(id) = field.input {
-        return Ok(described(app, id, &format!("{pointer}/input")).await?.dimension());
+        return Ok(described(app, tenant, id, &format!("{pointer}/input")).await?.dimension());
     }
     let Some(scene) = field.scene.clone() else { return Ok(3) };
     // a scene may be large: checked off the runtime

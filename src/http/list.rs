@@ -1,6 +1,7 @@
 //! `GET /v1/jobs`: newest first, page by page.
 
 use super::{App, Problem, query};
+use crate::auth::{Caller, Scope};
 use crate::engine::ListQuery;
 use crate::job::{Job, JobId, State};
 use axum::Json;
@@ -45,7 +46,12 @@ pub struct JobPage {
         (status = 400, description = "a parameter is malformed"),
     )
 )]
-pub async fn list(Shared(app): Shared<App>, RawQuery(raw): RawQuery) -> Result<(HeaderMap, Json<JobPage>), Problem> {
+pub async fn list(
+    Shared(app): Shared<App>,
+    caller: Caller,
+    RawQuery(raw): RawQuery,
+) -> Result<(HeaderMap, Json<JobPage>), Problem> {
+    let tenant = caller.may(Scope::Read)?;
     let known = ["state", "label", "created_from", "created_to", "limit", "cursor"];
     let parameters = query::parameters(raw.as_deref(), &known, &["state", "label"])?;
     let limit = query::number(&parameters, "limit")?.unwrap_or(DEFAULT_LIMIT);
@@ -77,7 +83,7 @@ pub async fn list(Shared(app): Shared<App>, RawQuery(raw): RawQuery) -> Result<(
     if wanted.labels.len() > MAX_LABELS {
         return Err(Problem::query(format!("label: at most {MAX_LABELS}")));
     }
-    let page = app.engine.list(wanted).await?;
+    let page = app.engine.list(tenant, wanted).await?;
     let next_cursor = page.jobs.last().filter(|_| page.more).map(|job| BASE64_URL_SAFE_NO_PAD.encode(job.id.0));
     let mut headers = HeaderMap::from_iter([(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"))]);
     if let Some(cursor) = &next_cursor {

@@ -4,6 +4,7 @@ use super::problem::ProblemDocument;
 use axum::Json;
 use utoipa::openapi::content::ContentBuilder;
 use utoipa::openapi::path::Operation;
+use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityRequirement, SecurityScheme};
 use utoipa::openapi::{OpenApi, Ref, RefOr, Response};
 use utoipa::{OpenApi as _, ToSchema as _};
 
@@ -39,10 +40,13 @@ pub(super) fn base() -> OpenApi {
 
 /// Gives every problem its body, and every operation the problems that any of them can have.
 pub(super) fn complete(mut document: OpenApi) -> OpenApi {
-    for item in document.paths.paths.values_mut() {
+    for (path, item) in &mut document.paths.paths {
         let operations =
             [&mut item.get, &mut item.head, &mut item.post, &mut item.delete, &mut item.put, &mut item.patch];
         for operation in operations.into_iter().flatten() {
+            if !super::caller::OPEN.contains(&path.as_str()) {
+                describe_caller(operation);
+            }
             describe_problems(operation);
         }
         // the router answers HEAD from GET; both are one operation, which needs an own name in each method
@@ -50,7 +54,25 @@ pub(super) fn complete(mut document: OpenApi) -> OpenApi {
             head.operation_id = head.operation_id.take().map(|id| format!("{id}_head"));
         }
     }
+    let bearer = HttpBuilder::new()
+        .scheme(HttpAuthScheme::Bearer)
+        .description(Some("an API key (`shrinkd keys create`), or a token of the configured OpenID Connect issuer"))
+        .build();
+    let components = document.components.get_or_insert_default();
+    components.add_security_scheme("bearer", SecurityScheme::Http(bearer));
     document
+}
+
+/// Whoever asks says who it is, where the service asks for it.
+fn describe_caller(operation: &mut Operation) {
+    let none = Vec::<String>::new();
+    operation.security = Some(vec![SecurityRequirement::new("bearer", none), SecurityRequirement::default()]);
+    for (status, description) in [
+        ("401", "a valid key or token is needed, where the service asks who its callers are"),
+        ("403", "the key or token lacks a scope"),
+    ] {
+        operation.responses.responses.entry(status.to_owned()).or_insert_with(|| RefOr::T(Response::new(description)));
+    }
 }
 
 fn describe_problems(operation: &mut Operation) {

@@ -3,6 +3,7 @@
 use super::conditional::{self, Part};
 use super::jobs::job_id;
 use super::{App, Problem, query};
+use crate::auth::{Caller, Scope};
 use crate::blobs::{BlobError, BlobId};
 use crate::job::OutputName;
 use axum::body::Body;
@@ -48,14 +49,16 @@ const CACHE: &str = "private, max-age=86400, immutable";
 )]
 pub async fn download(
     State(app): State<App>,
+    caller: Caller,
     Path((id, name)): Path<(String, String)>,
     RawQuery(raw): RawQuery,
     method: Method,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
+    let tenant = caller.may(Scope::Read)?;
     query::parameters(raw.as_deref(), &[], &[])?;
     let id = job_id(&id)?;
-    let job = app.engine.get(id).await?.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
+    let job = app.engine.get(tenant, id).await?.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
     let unknown = || {
         let detail = format!("the job has no output {name:?}");
         Problem::not_found("unknown_output", "there is no such output", detail)

@@ -1,6 +1,7 @@
 //! `/`: the newest jobs for a person, without scripts and without anything from another host.
 
 use super::{App, Problem};
+use crate::auth::{Caller, Scope};
 use crate::engine::ListQuery;
 use crate::job::Job;
 use axum::extract::State;
@@ -26,8 +27,10 @@ td,th{text-align:left;padding:.4rem;border-top:1px solid #ccc;vertical-align:mid
     tag = "operation",
     responses((status = 200, description = "a page", content_type = "text/html", body = String))
 )]
-pub async fn page(State(app): State<App>) -> Result<impl IntoResponse, Problem> {
-    let page = app.engine.list(ListQuery { limit: SHOWN, ..ListQuery::default() }).await?;
+pub async fn page(State(app): State<App>, caller: Caller) -> Result<impl IntoResponse, Problem> {
+    let tenant = caller.may(Scope::Read)?;
+    let newest = ListQuery { limit: SHOWN, ..ListQuery::default() };
+    let page = app.engine.list(tenant, newest).await?;
     let mut html = HEAD.to_owned();
     for job in &page.jobs {
         row(&mut html, job);

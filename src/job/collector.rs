@@ -1,5 +1,8 @@
 //! Removes blobs that no job names any more: expired outputs, and inputs that nobody came to use.
 //!
+//! An input goes tenant by tenant: first what describes it to a tenant whose jobs do not name it, however young another tenant
+//! keeps the bytes, and the bytes with the last of them.
+//!
 //! Guarantees: a blob that a remembered job names, and that has not expired, stays; so does one that was put or touched within
 //! [`Blobs::GRACE`], for its record may be on its way. Not guaranteed: that a blob goes at once; any number of nodes may collect at the same
 //! time.
@@ -53,10 +56,23 @@ pub async fn run(engine: Arc<dyn Engine>, blobs: Blobs, retention: Retention, st
 /// When the store or the engine fails.
 pub async fn collect(engine: &dyn Engine, blobs: &Blobs, retention: &Retention) -> Result<usize, CollectError> {
     let mut removed = 0;
+    let unused = Duration::from_secs(retention.inputs_s);
+    let mut notes = blobs.notes_older_than(unused);
+    while let Some((tenant, id)) = notes.try_next().await? {
+        let expired = retention.expired(Timestamp::now());
+        if engine.unnamed(Some(&tenant), vec![id.hex()], expired).await?.is_empty() {
+            continue;
+        }
+        // no job of this node comes to name it between the question and its end
+        let _sweep = blobs.sweep().await;
+        if !engine.unnamed(Some(&tenant), vec![id.hex()], expired).await?.is_empty() {
+            blobs.remove_older_note(&tenant, id, unused).await?;
+        }
+    }
     let mut batches = blobs.older_than(Blobs::GRACE).try_chunks(BATCH);
     while let Some(batch) = batches.try_next().await.map_err(|e| e.1)? {
         let hashes = batch.iter().map(BlobId::hex).collect();
-        for hash in engine.unnamed(hashes, retention.expired(Timestamp::now())).await? {
+        for hash in engine.unnamed(None, hashes, retention.expired(Timestamp::now())).await? {
             if let Some(id) = BlobId::from_hex(&hash)
                 && remove(engine, blobs, retention, id).await?
             {
@@ -65,13 +81,13 @@ pub async fn collect(engine: &dyn Engine, blobs: &Blobs, retention: &Retention) 
         }
     }
     let mut checkpoints = blobs.checkpoints_older_than(Blobs::GRACE);
-    while let Some(name) = checkpoints.try_next().await? {
+    while let Some((tenant, name)) = checkpoints.try_next().await? {
         let job = match name.parse() {
-            Ok(id) => engine.get(id).await?,
+            Ok(id) => engine.get(&tenant, id).await?,
             Err(_) => None,
         };
         if job.is_none_or(|job| job.state.ended()) {
-            blobs.remove_checkpoint(&name).await?;
+            blobs.remove_checkpoint(&tenant, &name).await?;
         }
     }
     Ok(removed)
@@ -79,12 +95,10 @@ pub async fn collect(engine: &dyn Engine, blobs: &Blobs, retention: &Retention) 
 
 /// Removes a blob that was not named a moment ago.
 async fn remove(engine: &dyn Engine, blobs: &Blobs, retention: &Retention, id: BlobId) -> Result<bool, CollectError> {
-    let is_input = blobs.note(id).await?.is_some();
-    let age = if is_input { Duration::from_secs(retention.inputs_s) } else { Blobs::GRACE };
     // no job of this node comes to name it between the question and its end
     let _sweep = blobs.sweep().await;
-    let unnamed = engine.unnamed(vec![id.hex()], retention.expired(Timestamp::now())).await?;
-    Ok(!unnamed.is_empty() && blobs.remove_older(id, age).await?)
+    let unnamed = engine.unnamed(None, vec![id.hex()], retention.expired(Timestamp::now())).await?;
+    Ok(!unnamed.is_empty() && !blobs.is_input(id).await? && blobs.remove_older(id, Blobs::GRACE).await?)
 }
 
 #[cfg(test)]
@@ -93,6 +107,7 @@ mod tests {
     use crate::engine::sqlite::SqliteEngine;
     use crate::engine::{NewJob, Outcome, Terms};
     use crate::job::{JobId, JobSpec, Output};
+    use crate::tenant::Tenant;
     use bytes::Bytes;
     use serde_json::json;
     use std::path::Path;
@@ -112,6 +127,7 @@ mod tests {
 
     #[tokio::test]
     async fn what_is_named_or_young_stays_and_the_rest_goes() {
+        let own = Tenant::default();
         let folder = tempfile::tempdir().expect("folder");
         let engine = SqliteEngine::open(&folder.path().join("engine"), Terms::default()).expect("engine");
         let store = folder.path().join("blobs");
@@ -121,10 +137,10 @@ mod tests {
         let [named, stray, unused, output] =
             [put("named").await, put("stray").await, put("unused").await, put("output").await];
         for input in [named, unused] {
-            blobs.put_note(input, Bytes::from_static(b"{}")).await.expect("notes");
+            blobs.put_note(&own, input, Bytes::from_static(b"{}")).await.expect("notes");
         }
         let spec = JobSpec::from_value(&json!({"field": {"input": named.to_string()}})).expect("a request");
-        engine.submit(NewJob { id: JobId::new(), spec, key: None }).await.expect("submits");
+        engine.submit(NewJob { tenant: own.clone(), id: JobId::new(), spec, key: None }).await.expect("submits");
         let claim = engine.claim("a", 1, Duration::ZERO).await.expect("claims").remove(0);
         let made = Output {
             name: "glb".to_owned(),
@@ -136,7 +152,7 @@ mod tests {
         };
         let outcome = Outcome::Succeeded { outputs: vec![made], metrics: json!({}) };
         engine.finish(&claim, outcome).await.expect("finishes");
-        blobs.put_checkpoint(&claim.id.to_string(), Bytes::from_static(b"c")).await.expect("puts");
+        blobs.put_checkpoint(&own, &claim.id.to_string(), Bytes::from_static(b"c")).await.expect("puts");
 
         let left = async || {
             let mut there = Vec::new();
@@ -149,14 +165,14 @@ mod tests {
         age(&store, 2 * Blobs::GRACE);
         assert_eq!(collect(&engine, &blobs, &retention).await.expect("collects"), 1);
         assert_eq!(left().await, [true, false, true, true], "an input may wait longer for a job");
-        assert_eq!(blobs.checkpoint(&claim.id.to_string()).await.expect("answers"), None);
+        assert_eq!(blobs.checkpoint(&own, &claim.id.to_string()).await.expect("answers"), None);
         age(&store, 5 * Blobs::GRACE);
-        assert!(blobs.touch(unused).await.expect("touches"));
+        assert!(blobs.touch(&own, unused).await.expect("touches"));
         assert_eq!(collect(&engine, &blobs, &retention).await.expect("collects"), 0, "it was touched");
         age(&store, 5 * Blobs::GRACE);
         assert_eq!(collect(&engine, &blobs, &retention).await.expect("collects"), 1);
         assert_eq!(left().await, [true, false, false, true]);
-        assert_eq!(blobs.note(unused).await.expect("answers"), None);
+        assert_eq!(blobs.note(&own, unused).await.expect("answers"), None);
         // outputs that are kept for a second after the job's end, and a second
         tokio::time::sleep(Duration::from_millis(1100)).await;
         let short = Retention { outputs_s: 1, ..retention };

@@ -178,7 +178,7 @@ impl Worker {
         self.end(&claim, outcome).await;
         if over
             && matches!(claim.spec.work, Work::Fit(_))
-            && let Err(error) = self.blobs.remove_checkpoint(&claim.id.to_string()).await
+            && let Err(error) = self.blobs.remove_checkpoint(&claim.tenant, &claim.id.to_string()).await
         {
             tracing::warn!(%error, "the checkpoint of an ended job could not be removed");
         }
@@ -215,13 +215,13 @@ impl Worker {
         let (blobs, pool) = (self.blobs.clone(), self.pool.clone());
         async move {
             let clock = Instant::now();
-            let (spec, name) = (claim.spec, claim.id.to_string());
+            let (tenant, spec, name) = (claim.tenant, claim.spec, claim.id.to_string());
             let mut inputs = Vec::new();
             for id in spec.work.blobs() {
                 inputs.push(read_input(&blobs, id).await?);
             }
             let before = match spec.work {
-                Work::Fit(_) => blobs.checkpoint(&name).await.unwrap_or_else(|error| {
+                Work::Fit(_) => blobs.checkpoint(&tenant, &name).await.unwrap_or_else(|error| {
                     tracing::warn!(%error, "the checkpoint could not be read; training begins anew");
                     None
                 }),
@@ -264,7 +264,7 @@ impl Worker {
                             if last.get().is_some_and(|last| last.elapsed() < CHECKPOINT_EVERY) {
                                 return;
                             }
-                            if let Err(error) = runtime.block_on(blobs.put_checkpoint(&name, bytes().into())) {
+                            if let Err(error) = runtime.block_on(blobs.put_checkpoint(&tenant, &name, bytes().into())) {
                                 tracing::warn!(%error, "a checkpoint could not be written");
                             }
                             last.set(Some(Instant::now()));

@@ -20,6 +20,7 @@ mod relaxed;
 #[path = "../support/bucket.rs"]
 mod s3;
 mod sensitivity;
+mod tenants;
 mod walk;
 mod warm;
 mod weight;

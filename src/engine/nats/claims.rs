@@ -5,12 +5,12 @@
 //! whose lease runs out.
 
 use super::Node;
-use super::layout::HANDOVER;
+use super::layout::{HANDOVER, Name};
 use super::ledger::{Found, Step};
 use super::link::patiently;
 use super::queue::Ticket;
 use crate::engine::{Claim, EngineError, Outcome};
-use crate::job::{Failure, JobId, JobSpec, State};
+use crate::job::{Failure, JobSpec, State};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::oneshot;
@@ -74,7 +74,7 @@ async fn wait_for(
                 Ok(claim) => claims.extend(claim),
                 Err(error) => {
                     // the id comes back to the queue
-                    warn!(job.id = %ticket.id, handover_s = HANDOVER.as_secs(), %error, "a job could not be claimed");
+                    warn!(job.id = %ticket.name.id, handover_s = HANDOVER.as_secs(), %error, "a job could not be claimed");
                 }
             }
         }
@@ -83,26 +83,26 @@ async fn wait_for(
 }
 
 async fn claim(node: &Node, ticket: &Ticket, worker: &str) -> Result<Option<Claim>, EngineError> {
-    let claimed = patiently(take_up(node, ticket.id, worker)).await?;
+    let claimed = patiently(take_up(node, &ticket.name, worker)).await?;
     ticket.settle().await;
     Ok(claimed)
 }
 
 /// Moves the record, if the job waits; `None` when it does not.
-async fn take_up(node: &Node, id: JobId, worker: &str) -> Result<Option<Claim>, EngineError> {
+async fn take_up(node: &Node, name: &Name, worker: &str) -> Result<Option<Claim>, EngineError> {
     let waits = |state| state == State::Queued;
     // that a job waits is believed from an older record, because storing would fail; that it does not is not
-    let version = match node.ledger.projection.seen(id).filter(|version| waits(version.record.job.state)) {
+    let version = match node.ledger.projection.seen(name.id).filter(|version| waits(version.record.job.state)) {
         Some(version) => version,
-        None => match node.ledger.read(id).await? {
+        None => match node.ledger.read(name).await? {
             Found::Job(version) if waits(version.record.job.state) => version,
             _ => return Ok(None),
         },
     };
     // before the record is moved, so that a stream that cannot be read costs no attempt
-    let request = node.ledger.request(id).await?;
+    let request = node.ledger.request(name).await?;
     let lease = node.terms.lease;
-    let taken = node.ledger.change(id, Some(version), |draft| {
+    let taken = node.ledger.change(name, Some(version), |draft| {
         if waits(draft.record.job.state) {
             draft.claim(worker, lease);
             Step::Write(true)
@@ -111,13 +111,13 @@ async fn take_up(node: &Node, id: JobId, worker: &str) -> Result<Option<Claim>, 
         }
     });
     let Some((true, record)) = taken.await? else { return Ok(None) };
-    let attempt = record.job.attempt;
+    let (Name { tenant, id }, attempt) = (name.clone(), record.job.attempt);
     match request.as_ref().map(JobSpec::from_value) {
-        Some(Ok(spec)) => Ok(Some(Claim { id, attempt, spec, worker: worker.to_owned(), lease })),
+        Some(Ok(spec)) => Ok(Some(Claim { tenant, id, attempt, spec, worker: worker.to_owned(), lease })),
         unreadable => {
             // accepted by another version that knew more
-            error!(job.id = %id, ?unreadable, "the stored request cannot be read");
-            let failed = node.ledger.change(id, None, |draft| {
+            error!(job.id = %name.id, ?unreadable, "the stored request cannot be read");
+            let failed = node.ledger.change(name, None, |draft| {
                 if draft.record.job.attempt != attempt || draft.record.job.state.ended() {
                     return Step::Leave(());
                 }

@@ -4,12 +4,12 @@
 //! The consumer is made anew from the last entry that came whenever anything is odd: a new connection, a heartbeat that is
 //! missing, a number that is left out. Entries that come twice do no harm.
 
-use super::layout::Layout;
+use super::layout::{Layout, Name};
 use super::ledger::Ledger;
 use super::link::{CALL, failed};
 use super::record::Entry;
 use crate::engine::EngineError;
-use crate::job::{Event, JobId};
+use crate::job::Event;
 use async_nats::jetstream::Message;
 use async_nats::jetstream::consumer::{AckPolicy, DeliverPolicy, pull};
 use futures::StreamExt;
@@ -137,20 +137,20 @@ async fn follow(ledger: &Ledger, position: &watch::Sender<Position>) -> Result<(
     }
 }
 
-fn read(message: &Message, seq: u64) -> Option<(u64, JobId, Entry)> {
-    let id = Layout::id_of(&message.subject)?;
+fn read(message: &Message, seq: u64) -> Option<(u64, Name, Entry)> {
+    let name = Layout::name_of(&message.subject)?;
     match Entry::read(&message.payload) {
-        Ok(entry) => Some((seq, id, entry)),
+        Ok(entry) => Some((seq, name, entry)),
         // stored by another version that knew more
         Err(error) => {
-            error!(job.id = %id, nats.seq = seq, %error, "an entry cannot be read");
+            error!(job.id = %name.id, nats.seq = seq, %error, "an entry cannot be read");
             None
         }
     }
 }
 
 /// A consumer that is read once from the beginning, or followed, and then left.
-fn passing(filter_subject: String) -> pull::Config {
+pub(super) fn passing(filter_subject: String) -> pull::Config {
     pull::Config {
         filter_subject,
         deliver_policy: DeliverPolicy::All,
@@ -165,9 +165,9 @@ fn passing(filter_subject: String) -> pull::Config {
 
 /// All events that a job's subject holds, and the number of the newest entry among them. Needed once for a job that began
 /// before this node did, and only when somebody asks.
-pub(super) async fn history(ledger: &Ledger, id: JobId) -> Result<(Vec<Event>, u64), EngineError> {
+pub(super) async fn history(ledger: &Ledger, name: &Name) -> Result<(Vec<Event>, u64), EngineError> {
     let what = "the events of a job";
-    let consumer = ledger.layout.jobs.create_consumer(passing(ledger.layout.job(id))).await;
+    let consumer = ledger.layout.jobs.create_consumer(passing(ledger.layout.job(name))).await;
     let consumer = consumer.map_err(|e| failed(what)(e.into()))?;
     let info = consumer.cached_info();
     let (name, stored) = (info.name.clone(), info.num_pending as usize);

@@ -1,7 +1,7 @@
 //! What nobody will ask for any more is removed from the streams: tombstones that no idempotency key remembers, the events of
 //! jobs that ended long ago, and requests whose job was never made. Every node does it, once an hour, at a time of its own.
 
-use super::layout::{KEY_LIFETIME, Layout};
+use super::layout::{KEY_LIFETIME, Layout, Name};
 use super::ledger::{Found, Ledger};
 use super::link::failed;
 use super::sweeper::jittered;
@@ -47,19 +47,19 @@ pub(super) async fn tidy(ledger: &Ledger, now: Timestamp) -> Result<(), EngineEr
 
 async fn remove_tombstones(ledger: &Ledger, then: Timestamp) -> Result<(), EngineError> {
     let forgotten = ledger.projection.forgotten_before(then).await?;
-    for id in &forgotten {
-        purge(&ledger.layout.jobs, ledger.layout.job(*id), 0).await?;
+    for name in &forgotten {
+        purge(&ledger.layout.jobs, ledger.layout.job(name), 0).await?;
     }
-    ledger.projection.drop_forgotten(forgotten).await
+    ledger.projection.drop_forgotten(forgotten.into_iter().map(|name| name.id).collect()).await
 }
 
 async fn thin_ended_jobs(ledger: &Ledger, then: Timestamp) -> Result<(), EngineError> {
-    let ended: HashSet<JobId> = ledger.projection.ended_before(then).await?.into_iter().collect();
+    let ended: HashSet<Name> = ledger.projection.ended_before(then).await?.into_iter().collect();
     if ended.is_empty() {
         return Ok(());
     }
     for (subject, entries) in subjects(&ledger.layout.jobs, ledger.layout.every_job()).await? {
-        if entries > 1 && Layout::id_of(&subject).is_some_and(|id| ended.contains(&id)) {
+        if entries > 1 && Layout::name_of(&subject).is_some_and(|name| ended.contains(&name)) {
             purge(&ledger.layout.jobs, subject, 1).await?;
         }
     }
@@ -68,12 +68,12 @@ async fn thin_ended_jobs(ledger: &Ledger, then: Timestamp) -> Result<(), EngineE
 
 async fn remove_orphaned_requests(ledger: &Ledger, then: Timestamp) -> Result<(), EngineError> {
     for (subject, _) in subjects(&ledger.layout.specs, ledger.layout.every_spec()).await? {
-        let Some(id) = Layout::id_of(&subject) else { continue };
-        let is_old = made_at(id).is_some_and(|made| made < then);
-        if !is_old || ledger.projection.knows(id).await? {
+        let Some(name) = Layout::name_of(&subject) else { continue };
+        let is_old = made_at(name.id).is_some_and(|made| made < then);
+        if !is_old || ledger.projection.knows(name.id).await? {
             continue;
         }
-        if matches!(ledger.read(id).await?, Found::Nothing | Found::Forgotten) {
+        if matches!(ledger.read(&name).await?, Found::Nothing | Found::Forgotten) {
             purge(&ledger.layout.specs, subject, 0).await?;
         }
     }

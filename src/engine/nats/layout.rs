@@ -2,15 +2,19 @@
 //!
 //! | stream | subjects | holds |
 //! |---|---|---|
-//! | `SHRINKD_JOBS` | `SHRINKD.job.{id}` | entries of a job: the newest is its record, the older ones its events |
-//! | `SHRINKD_SPECS` | `SHRINKD.spec.{id}` | the request, once; apart, because it may be large and never changes |
-//! | `SHRINKD_KEYS` | `SHRINKD.key.{hash}` | idempotency keys, for 24 hours |
-//! | `SHRINKD_WORK` | `SHRINKD.work.{id}` | ids of jobs that wait for a worker; a work queue |
+//! | `SHRINKD_JOBS` | `SHRINKD.job.{tenant}.{id}` | entries of a job: the newest is its record, the older ones its events |
+//! | `SHRINKD_SPECS` | `SHRINKD.spec.{tenant}.{id}` | the request, once; apart, because it may be large and never changes |
+//! | `SHRINKD_KEYS` | `SHRINKD.key.{tenant}.{hash}` | idempotency keys, for 24 hours |
+//! | `SHRINKD_WORK` | `SHRINKD.work.{tenant}.{id}` | ids of jobs that wait for a worker; a work queue |
+//!
+//! The tenant is part of the subject, so that what another tenant has is asked for where nothing is. The default tenant's subjects
+//! leave it out, as all did before there were tenants.
 
 use super::address::Address;
 use super::link::{Link, failed};
 use crate::engine::EngineError;
 use crate::job::JobId;
+use crate::tenant::Tenant;
 use async_nats::jetstream::consumer::{AckPolicy, PullConsumer, pull};
 use async_nats::jetstream::stream::{Config, DiscardPolicy, RetentionPolicy, StorageType, Stream};
 use sha2::{Digest, Sha256};
@@ -31,6 +35,22 @@ const WAITING: i64 = 8192;
 /// The one consumer of the queue, which all workers share.
 const WORKERS: &str = "workers";
 
+/// What stands for a dot of a tenant's name in a subject, where dots separate. No name holds it.
+const DOT: &str = "=";
+
+/// A job's name in the streams: whose it is, and its id.
+#[derive(Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(super) struct Name {
+    pub tenant: Tenant,
+    pub id: JobId,
+}
+
+impl Name {
+    pub(super) fn new(tenant: &Tenant, id: JobId) -> Self {
+        Self { tenant: tenant.clone(), id }
+    }
+}
+
 /// Handles on the streams; reading their own description is not needed.
 #[derive(Clone)]
 pub(super) struct Layout {
@@ -48,7 +68,7 @@ impl Layout {
         let prefix = &address.prefix;
         let base = |name: &str, subject: &str| Config {
             name: format!("{prefix}_{name}"),
-            subjects: vec![format!("{prefix}.{subject}.*")],
+            subjects: vec![format!("{prefix}.{subject}.>")],
             storage: StorageType::File,
             num_replicas: address.replicas,
             discard: DiscardPolicy::Old,
@@ -70,39 +90,49 @@ impl Layout {
         })
     }
 
-    pub(super) fn job(&self, id: JobId) -> String {
-        format!("{}.job.{id}", self.prefix)
+    fn subject(&self, kind: &str, tenant: &Tenant, last: impl std::fmt::Display) -> String {
+        subject_of(&self.prefix, kind, tenant, last)
+    }
+
+    pub(super) fn job(&self, name: &Name) -> String {
+        self.subject("job", &name.tenant, name.id)
     }
 
     pub(super) fn every_job(&self) -> String {
-        format!("{}.job.*", self.prefix)
+        format!("{}.job.>", self.prefix)
     }
 
-    pub(super) fn spec(&self, id: JobId) -> String {
-        format!("{}.spec.{id}", self.prefix)
+    pub(super) fn spec(&self, name: &Name) -> String {
+        self.subject("spec", &name.tenant, name.id)
     }
 
     pub(super) fn every_spec(&self) -> String {
-        format!("{}.spec.*", self.prefix)
+        format!("{}.spec.>", self.prefix)
     }
 
-    pub(super) fn work(&self, id: JobId) -> String {
-        format!("{}.work.{id}", self.prefix)
+    pub(super) fn work(&self, name: &Name) -> String {
+        self.subject("work", &name.tenant, name.id)
     }
 
     pub(super) fn every_work(&self) -> String {
-        format!("{}.work.*", self.prefix)
+        format!("{}.work.>", self.prefix)
     }
 
     /// A client chooses its keys freely, and a subject cannot hold every text.
-    pub(super) fn key(&self, key: &str) -> String {
+    pub(super) fn key(&self, tenant: &Tenant, key: &str) -> String {
         let hash: String = Sha256::digest(key.as_bytes()).iter().map(|byte| format!("{byte:02x}")).collect();
-        format!("{}.key.{hash}", self.prefix)
+        self.subject("key", tenant, hash)
     }
 
     /// The job that a subject belongs to.
-    pub(super) fn id_of(subject: &str) -> Option<JobId> {
-        subject.rsplit('.').next()?.parse().ok()
+    pub(super) fn name_of(subject: &str) -> Option<Name> {
+        let tokens: Vec<&str> = subject.split('.').collect();
+        let (tenant, id) = match tokens[..] {
+            [_, _, id] => (Tenant::default(), id),
+            [_, _, tenant, id] => (tenant.replace(DOT, ".").parse().ok()?, id),
+            _ => return None,
+        };
+        Some(Name { tenant, id: id.parse().ok()? })
     }
 
     /// The queue's consumer, made when it is not there.
@@ -121,10 +151,25 @@ impl Layout {
     }
 }
 
-async fn open(link: &Link, wanted: Config) -> Result<Stream<()>, EngineError> {
+/// The subject of something that a tenant has.
+fn subject_of(prefix: &str, kind: &str, tenant: &Tenant, last: impl std::fmt::Display) -> String {
+    if tenant.is_default() {
+        return format!("{prefix}.{kind}.{last}");
+    }
+    format!("{prefix}.{kind}.{}.{last}", tenant.name().replace('.', DOT))
+}
+
+pub(super) async fn open(link: &Link, wanted: Config) -> Result<Stream<()>, EngineError> {
     let what = format!("stream {}", wanted.name);
     let stream = link.context.get_or_create_stream(wanted.clone()).await.map_err(|e| failed(&what)(e.into()))?;
-    let found = &stream.cached_info().config;
+    let found = match &stream.cached_info().config {
+        // made before subjects named tenants
+        found if found.subjects == wanted.subjects.iter().map(|s| s.replace('>', "*")).collect::<Vec<_>>() => {
+            let wider = Config { subjects: wanted.subjects.clone(), ..found.clone() };
+            &link.context.update_stream(wider).await.map_err(|e| failed(&what)(e.into()))?.config
+        }
+        found => found,
+    };
     if found.storage != StorageType::File {
         warn!(nats.stream = found.name, "the stream is kept in memory: a restart of the servers loses every job in it");
     }
@@ -143,4 +188,21 @@ async fn open(link: &Link, wanted: Config) -> Result<Stream<()>, EngineError> {
         warn!(nats.stream = found.name, "the stream has other limits than this version of the service gives it");
     }
     link.context.get_stream_no_info(&wanted.name).await.map_err(|e| failed(&what)(e.into()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_subject_names_the_tenant_and_the_default_tenants_are_as_they_were() {
+        for (tenant, subject) in [("default", "P.job."), ("a", "P.job.a."), ("a.b-c", "P.job.a=b-c.")] {
+            let name = Name { tenant: tenant.parse().expect("a name"), id: JobId::new() };
+            let whole = format!("{subject}{}", name.id);
+            assert_eq!(subject_of("P", "job", &name.tenant, name.id), whole);
+            assert_eq!(Layout::name_of(&whole), Some(name));
+        }
+        assert_eq!(Layout::name_of("P.job.a.b.c"), None);
+        assert_eq!(Layout::name_of("P.job.no-id"), None);
+    }
 }

@@ -18,9 +18,9 @@ use crate::job::State;
 /// Takes the jobs from workers that were not heard of for the time of their lease.
 pub(super) async fn take_from_the_lost(node: &Node) {
     for seen in node.ledger.projection.open_jobs(is_lost) {
-        let id = seen.version.record.job.id;
+        let name = seen.version.record.name();
         if let Err(error) = patiently(take(node, &seen)).await {
-            tracing::warn!(job.id = %id, %error, "a lost job could not be queued again");
+            tracing::warn!(job.id = %name.id, %error, "a lost job could not be queued again");
         }
     }
 }
@@ -30,16 +30,16 @@ fn is_lost(seen: &Seen) -> bool {
 }
 
 async fn take(node: &Node, seen: &Seen) -> Result<(), EngineError> {
-    let id = seen.version.record.job.id;
+    let name = seen.version.record.name();
     let mut draft = Draft::of(Record::clone(&seen.version.record));
     draft.lose(node.terms.max_losses);
-    let Some(record) = node.ledger.write(id, draft, Expect::Newest(seen.version.seq)).await? else {
+    let Some(record) = node.ledger.write(&name, draft, Expect::Newest(seen.version.seq)).await? else {
         // the worker lives, or another node was faster: reading it shows the entry that was missed
-        return node.ledger.read(id).await.map(|_| ());
+        return node.ledger.read(&name).await.map(|_| ());
     };
-    tracing::warn!(job.id = %id, losses = record.losses, "a worker was lost");
+    tracing::warn!(job.id = %name.id, losses = record.losses, "a worker was lost");
     if record.job.state == State::Queued {
-        node.enqueue(id).await;
+        node.enqueue(&name).await;
     }
     Ok(())
 }

@@ -8,6 +8,7 @@
 //! job have no gap. Not guaranteed: that what another node stored is here already. Whatever must not miss that is asked of
 //! the stream.
 
+use super::layout::Name;
 use super::ledger::Version;
 use super::record::{Entry, Record};
 use crate::engine::sqlite::records::{self, Ctx, KEPT_EVENTS};
@@ -15,6 +16,7 @@ use crate::engine::sqlite::writer::{Hub, Writer};
 use crate::engine::sqlite::{Readers, schema};
 use crate::engine::{EngineError, EventPage, ListQuery, Page};
 use crate::job::{Event, JobId};
+use crate::tenant::Tenant;
 use jiff::Timestamp;
 use rusqlite::{Connection, OptionalExtension, params};
 use std::collections::HashMap;
@@ -28,6 +30,7 @@ use tokio::sync::broadcast;
 const TABLE: &str = "
     CREATE TABLE projected (
         job          TEXT PRIMARY KEY,
+        tenant       TEXT NOT NULL,
         seq          INTEGER NOT NULL,
         whole        INTEGER NOT NULL,
         forgotten_at INTEGER
@@ -66,11 +69,11 @@ impl Projection {
     }
 
     /// Takes entries in, with their numbers in the stream.
-    pub(super) async fn apply(&self, entries: Vec<(u64, JobId, Entry)>) -> Result<(), EngineError> {
+    pub(super) async fn apply(&self, entries: Vec<(u64, Name, Entry)>) -> Result<(), EngineError> {
         let open = self.open.clone();
         let applied = self.writer.run(move |ctx| {
-            for (seq, id, entry) in entries {
-                apply(ctx, &open, seq, id, entry)?;
+            for (seq, name, entry) in entries {
+                apply(ctx, &open, seq, name, entry)?;
             }
             Ok(())
         });
@@ -93,24 +96,26 @@ impl Projection {
         self.lock_open().values_mut().for_each(|seen| seen.at = now);
     }
 
-    pub(super) fn subscribe(&self, id: JobId) -> broadcast::Receiver<Arc<Event>> {
-        self.hub.subscribe(id)
+    pub(super) fn subscribe(&self, tenant: &Tenant, id: JobId) -> broadcast::Receiver<Arc<Event>> {
+        self.hub.subscribe(tenant, id)
     }
 
-    pub(super) async fn list(&self, query: ListQuery) -> Result<Page, EngineError> {
-        self.readers.run(move |c| records::list(c, &query)).await
+    pub(super) async fn list(&self, tenant: &Tenant, query: ListQuery) -> Result<Page, EngineError> {
+        let tenant = tenant.clone();
+        self.readers.run(move |c| records::list(c, &tenant, &query)).await
     }
 
     /// A page of events, and whether the job's events go back as far as the stream's; `None` when the job is not here.
     pub(super) async fn events_after(
         &self,
-        id: JobId,
+        name: &Name,
         after: u64,
         limit: usize,
     ) -> Result<Option<(EventPage, bool)>, EngineError> {
+        let Name { tenant, id } = name.clone();
         self.readers
             .run(move |c| {
-                let Some(page) = records::events_after(c, id, after, limit)? else { return Ok(None) };
+                let Some(page) = records::events_after(c, &tenant, id, after, limit)? else { return Ok(None) };
                 let whole = "SELECT whole FROM projected WHERE job = ?1";
                 let whole = c.prepare_cached(whole)?.query_row([id.to_string()], |row| row.get(0))?;
                 Ok(Some((page, whole)))
@@ -123,18 +128,20 @@ impl Projection {
         self.writer.run(move |ctx| complete(ctx, id, &events, seq)).await
     }
 
-    /// Those of the hashes that no job names; jobs that ended before `expired` do not count.
+    /// Those of the hashes that no job names, of `whose` where that is given; jobs that ended before `expired` do not count.
     pub(super) async fn unnamed(
         &self,
+        whose: Option<&Tenant>,
         hashes: Vec<String>,
         expired: Option<Timestamp>,
     ) -> Result<Vec<String>, EngineError> {
-        self.readers.run(move |c| records::unnamed(c, hashes, expired)).await
+        let whose = whose.cloned();
+        self.readers.run(move |c| records::unnamed(c, whose.as_ref(), hashes, expired)).await
     }
 
     /// Jobs that were forgotten before then.
-    pub(super) async fn forgotten_before(&self, then: Timestamp) -> Result<Vec<JobId>, EngineError> {
-        self.ids("SELECT job FROM projected WHERE forgotten_at < ?1", then).await
+    pub(super) async fn forgotten_before(&self, then: Timestamp) -> Result<Vec<Name>, EngineError> {
+        self.names("SELECT tenant, job FROM projected WHERE forgotten_at < ?1", then).await
     }
 
     /// Drops the memory of forgotten jobs.
@@ -154,8 +161,8 @@ impl Projection {
     }
 
     /// Jobs that ended before then.
-    pub(super) async fn ended_before(&self, then: Timestamp) -> Result<Vec<JobId>, EngineError> {
-        self.ids("SELECT id FROM jobs WHERE finished_at < ?1", then).await
+    pub(super) async fn ended_before(&self, then: Timestamp) -> Result<Vec<Name>, EngineError> {
+        self.names("SELECT tenant, id FROM jobs WHERE finished_at < ?1", then).await
     }
 
     /// Drops the events of jobs that ended before then; a reader who asks for them after all gets them from the stream.
@@ -170,13 +177,19 @@ impl Projection {
         dropped.await
     }
 
-    async fn ids(&self, query: &'static str, then: Timestamp) -> Result<Vec<JobId>, EngineError> {
-        let ids = self.readers.run(move |c| {
+    async fn names(&self, query: &'static str, then: Timestamp) -> Result<Vec<Name>, EngineError> {
+        let names = self.readers.run(move |c| {
             let mut statement = c.prepare_cached(query)?;
-            let ids = statement.query_map([then.as_millisecond()], |row| row.get::<_, String>(0))?;
-            ids.map(|id| id?.parse().map_err(records::corrupt)).collect()
+            let rows = statement
+                .query_map([then.as_millisecond()], |row| Ok((row.get::<_, String>(0)?, row.get::<_, String>(1)?)))?;
+            rows.map(|row| {
+                let (tenant, id) = row?;
+                let tenant = tenant.parse().map_err(records::corrupt)?;
+                Ok(Name { tenant, id: id.parse().map_err(records::corrupt)? })
+            })
+            .collect()
         });
-        ids.await
+        names.await
     }
 
     fn lock_open(&self) -> MutexGuard<'_, HashMap<JobId, Seen>> {
@@ -217,7 +230,8 @@ fn connect(path: &Path) -> Result<Connection, EngineError> {
     Ok(connection)
 }
 
-fn apply(ctx: &mut Ctx<'_>, open: &Open, seq: u64, id: JobId, entry: Entry) -> rusqlite::Result<()> {
+fn apply(ctx: &mut Ctx<'_>, open: &Open, seq: u64, name: Name, entry: Entry) -> rusqlite::Result<()> {
+    let Name { tenant, id } = name;
     let text_id = id.to_string();
     let projected = "SELECT seq FROM projected WHERE job = ?1";
     let projected: Option<u64> =
@@ -230,7 +244,7 @@ fn apply(ctx: &mut Ctx<'_>, open: &Open, seq: u64, id: JobId, entry: Entry) -> r
         Entry::Forgotten { at } => {
             open.remove(&id);
             ctx.connection.execute("DELETE FROM jobs WHERE id = ?1", [&text_id])?;
-            note(ctx, &text_id, seq, true, Some(at))
+            note(ctx, &tenant, &text_id, seq, true, Some(at))
         }
         Entry::Changed { record, told } => {
             let newest = "SELECT last_seq FROM jobs WHERE id = ?1";
@@ -247,7 +261,7 @@ fn apply(ctx: &mut Ctx<'_>, open: &Open, seq: u64, id: JobId, entry: Entry) -> r
                 // entries in between were missed, so what was kept has no connection to what comes now
                 _ => {
                     ctx.connection.prepare_cached("DELETE FROM events WHERE job = ?1")?.execute([&text_id])?;
-                    note(ctx, &text_id, seq, before == 0, None)?;
+                    note(ctx, &tenant, &text_id, seq, before == 0, None)?;
                 }
             }
             for event in &told {
@@ -263,16 +277,23 @@ fn apply(ctx: &mut Ctx<'_>, open: &Open, seq: u64, id: JobId, entry: Entry) -> r
                 let version = Version { seq, record: Arc::from(record) };
                 open.insert(id, Seen { version, at: Instant::now() });
             }
-            ctx.events.extend(told.into_iter().map(|event| (id, Arc::new(event))));
+            ctx.events.extend(told.into_iter().map(|event| (tenant.clone(), id, Arc::new(event))));
             Ok(())
         }
     }
 }
 
-fn note(ctx: &Ctx<'_>, id: &str, seq: u64, whole: bool, forgotten: Option<Timestamp>) -> rusqlite::Result<()> {
-    let text = "INSERT OR REPLACE INTO projected (job, seq, whole, forgotten_at) VALUES (?1, ?2, ?3, ?4)";
+fn note(
+    ctx: &Ctx<'_>,
+    tenant: &Tenant,
+    id: &str,
+    seq: u64,
+    whole: bool,
+    forgotten: Option<Timestamp>,
+) -> rusqlite::Result<()> {
+    let text = "INSERT OR REPLACE INTO projected (tenant, job, seq, whole, forgotten_at) VALUES (?1, ?2, ?3, ?4, ?5)";
     let forgotten = forgotten.map(|at| at.as_millisecond());
-    ctx.connection.prepare_cached(text)?.execute(params![id, seq, whole, forgotten]).map(|_| ())
+    ctx.connection.prepare_cached(text)?.execute(params![tenant.name(), id, seq, whole, forgotten]).map(|_| ())
 }
 
 fn insert_event(ctx: &Ctx<'_>, id: &str, event: &Event) -> rusqlite::Result<()> {
@@ -291,8 +312,8 @@ fn upsert(ctx: &Ctx<'_>, id: &str, record: &Record, is_new: bool) -> rusqlite::R
     };
     // the request is read from its stream, when somebody wants it
     let text = "INSERT INTO jobs (id, state, attempt, revision, last_seq, created_at, started_at, finished_at, spec, labels, kind,
-                    settings, progress, metrics, outputs, problem)
-                VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8, '', ?9, ?10, ?11, ?12, ?13, ?14, ?15)
+                    settings, progress, metrics, outputs, problem, tenant)
+                VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8, '', ?9, ?10, ?11, ?12, ?13, ?14, ?15, ?16)
                 ON CONFLICT (id) DO UPDATE SET state = ?2, attempt = ?3, revision = ?4, last_seq = ?5, started_at = ?7,
                     finished_at = ?8, progress = ?12, metrics = ?13, outputs = ?14, problem = ?15";
     ctx.connection.prepare_cached(text)?.execute(params![
@@ -311,14 +332,15 @@ fn upsert(ctx: &Ctx<'_>, id: &str, record: &Record, is_new: bool) -> rusqlite::R
         job.metrics.as_ref().map(records::to_json).transpose()?,
         records::to_json(&job.outputs)?,
         job.problem.as_ref().map(records::to_json).transpose()?,
+        record.tenant.name(),
     ])?;
     // what the tables beside hold changes only at the ends of a life
     if !is_new && !job.state.ended() {
         return Ok(());
     }
     for (name, value) in &job.labels {
-        let text = "INSERT OR IGNORE INTO labels (job, name, value) VALUES (?1, ?2, ?3)";
-        ctx.connection.prepare_cached(text)?.execute(params![id, name, value])?;
+        let text = "INSERT OR IGNORE INTO labels (tenant, job, name, value) VALUES (?1, ?2, ?3, ?4)";
+        ctx.connection.prepare_cached(text)?.execute(params![record.tenant.name(), id, name, value])?;
     }
     let outputs = job.outputs.iter().map(|output| (&output.name, &output.sha256));
     for (name, hash) in outputs.chain(record.held.iter().map(|(name, hash)| (name, hash))) {

@@ -4,10 +4,9 @@
 //! or late, and one that is missing is put back by the [sweeper](super::sweeper). A job that comes back to the queue comes
 //! back at its end.
 
-use super::layout::Layout;
+use super::layout::{Layout, Name};
 use super::link::{Expect, Link, failed};
 use crate::engine::EngineError;
-use crate::job::JobId;
 use async_nats::jetstream::AckKind;
 use async_nats::jetstream::Message;
 use async_nats::jetstream::consumer::PullConsumer;
@@ -27,7 +26,7 @@ pub(super) struct Queue {
 
 /// An id that was taken from the queue. It comes back to it unless it is [settled](Ticket::settle).
 pub(super) struct Ticket {
-    pub id: JobId,
+    pub name: Name,
     message: Message,
 }
 
@@ -38,8 +37,8 @@ impl Queue {
     }
 
     /// Puts a job in the queue; one that is there moves to its end.
-    pub(super) async fn push(&self, id: JobId) -> Result<(), EngineError> {
-        self.link.store(&self.layout.work, self.layout.work(id), Bytes::new(), Expect::Any).await.map(|_| ())
+    pub(super) async fn push(&self, name: &Name) -> Result<(), EngineError> {
+        self.link.store(&self.layout.work, self.layout.work(name), Bytes::new(), Expect::Any).await.map(|_| ())
     }
 
     /// Up to `slots` ids that wait now, oldest first.
@@ -69,8 +68,8 @@ async fn tickets(messages: Vec<Result<Message, async_nats::Error>>) -> Result<Ve
     let mut tickets = Vec::new();
     for message in messages {
         let message = message.map_err(failed("the queue"))?;
-        match Layout::id_of(&message.subject) {
-            Some(id) => tickets.push(Ticket { id, message }),
+        match Layout::name_of(&message.subject) {
+            Some(name) => tickets.push(Ticket { name, message }),
             // not one of ours: nobody could do anything with it
             None => {
                 let _ = message.ack_with(AckKind::Term).await;
@@ -85,7 +84,7 @@ impl Ticket {
     pub(super) async fn settle(&self) {
         if let Err(error) = self.message.double_ack().await {
             // it comes back, and is settled then
-            tracing::warn!(job.id = %self.id, %error, "an id could not be taken from the queue");
+            tracing::warn!(job.id = %self.name.id, %error, "an id could not be taken from the queue");
         }
     }
 }

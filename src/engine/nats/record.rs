@@ -4,10 +4,12 @@
 //! events cannot disagree, whoever dies when, and there is nothing to mend. (The plan had a stream of its own for events,
 //! and an outbox between the two.) The newest entry is the job; the older ones are its events.
 
+use super::layout::Name;
 use crate::engine::{Claim, NewJob, Outcome, Renewal, Update};
 use crate::job::spec::INPUT;
 use crate::job::spec::Work;
-use crate::job::{Event, EventKind, Failure, Job, JobId, JobSpec, Output, State};
+use crate::job::{Event, EventKind, Failure, Job, Output, State};
+use crate::tenant::Tenant;
 use bytes::Bytes;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -18,6 +20,9 @@ use std::time::Duration;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Record {
     pub job: Job,
+    /// Whose it is; records of the time before there were tenants do not say.
+    #[serde(default)]
+    pub tenant: Tenant,
     /// Number of the newest event.
     pub last_seq: u64,
     /// Workers that were lost over it.
@@ -77,7 +82,8 @@ pub(super) fn now() -> Timestamp {
 
 impl Record {
     /// A new job, before anything was told of it.
-    fn accepted(id: JobId, spec: &JobSpec, created_at: Timestamp) -> Self {
+    fn accepted(new: &NewJob, created_at: Timestamp) -> Self {
+        let (id, spec) = (new.id, &new.spec);
         let (mut shrink, mut fit, mut of) = (None, None, None);
         match &spec.work {
             Work::Shrink(work) => shrink = Some(work.shrink.clone()),
@@ -105,7 +111,11 @@ impl Record {
         };
         let held = spec.work.held().into_iter().map(|(name, blob)| (name.to_owned(), blob));
         let held = held.chain(spec.work.inputs()).map(|(name, blob)| (name, blob.hex())).collect();
-        Self { job, last_seq: 0, losses: 0, hold: None, held }
+        Self { job, tenant: new.tenant.clone(), last_seq: 0, losses: 0, hold: None, held }
+    }
+
+    pub(super) fn name(&self) -> Name {
+        Name::new(&self.tenant, self.job.id)
     }
 
     /// Whether a claim still holds. Fenced by the attempt: the number moves on with every claim. What is lost stays lost, so
@@ -153,7 +163,7 @@ impl Draft {
 
     /// A new job, queued.
     pub(super) fn accepted(new: &NewJob, created_at: Timestamp) -> Self {
-        let record = Record::accepted(new.id, &new.spec, created_at);
+        let record = Record::accepted(new, created_at);
         let mut draft = Self { record, told: Vec::new(), now: created_at };
         draft.tell_state();
         draft

@@ -4,11 +4,11 @@
 //! own memory, and while jobs wait for long a question to the servers every few seconds.
 
 use super::Node;
-use super::layout::Layout;
+use super::layout::{Layout, Name};
 use super::leases;
 use crate::engine::EngineError;
 use crate::engine::nats::link::{failed, patiently};
-use crate::job::{JobId, State};
+use crate::job::State;
 use futures::TryStreamExt;
 use std::collections::HashSet;
 use std::sync::Weak;
@@ -78,14 +78,14 @@ async fn put_back_missing(node: &Node, trusting: bool) -> Result<(), EngineError
         .try_collect()
         .await
         .map_err(|e| failed("the queue")(e.into()))?;
-    let queued: HashSet<JobId> = subjects.iter().filter_map(|(subject, _)| Layout::id_of(subject)).collect();
-    let mut missing: Vec<JobId> =
-        waiting.iter().map(|seen| seen.version.record.job.id).filter(|id| !queued.contains(id)).collect();
-    missing.sort_unstable();
-    for id in missing {
+    let queued: HashSet<Name> = subjects.iter().filter_map(|(subject, _)| Layout::name_of(subject)).collect();
+    let mut missing: Vec<Name> =
+        waiting.iter().map(|seen| seen.version.record.name()).filter(|name| !queued.contains(name)).collect();
+    missing.sort_unstable_by_key(|name| name.id);
+    for name in missing {
         // it may have been taken up meanwhile: then a worker passes it over
-        warn!(job.id = %id, "a job that waits was not in the queue");
-        node.queue.push(id).await?;
+        warn!(job.id = %name.id, "a job that waits was not in the queue");
+        node.queue.push(&name).await?;
     }
     Ok(())
 }

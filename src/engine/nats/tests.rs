@@ -35,6 +35,10 @@ impl Cluster {
     }
 }
 
+fn own() -> Tenant {
+    Tenant::default()
+}
+
 async fn submit(engine: &NatsEngine) -> JobId {
     match engine.submit(conformance::new_job()).await.expect("submits") {
         Submitted::Created(job) => job.id,
@@ -49,7 +53,7 @@ async fn claim(engine: &NatsEngine) -> Claim {
 }
 
 async fn job(engine: &NatsEngine, id: JobId) -> Job {
-    engine.get(id).await.expect("reads").expect("is there")
+    engine.get(&own(), id).await.expect("reads").expect("is there")
 }
 
 /// Waits until it is so.

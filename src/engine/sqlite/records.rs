@@ -3,6 +3,7 @@
 use crate::engine::{Claim, EventPage, ListQuery, NewJob, Page, Renewal, Update};
 use crate::job::spec::Work;
 use crate::job::{Event, EventKind, Failure, Job, JobId, JobKind, Output, ProgressView, State};
+use crate::tenant::Tenant;
 use jiff::Timestamp;
 use rusqlite::types::Value as Sql;
 use rusqlite::{Connection, OptionalExtension, Row, params, params_from_iter};
@@ -21,7 +22,7 @@ pub(in crate::engine) struct Ctx<'a> {
     /// Milliseconds since the epoch.
     pub now: i64,
     /// Told after the commit.
-    pub events: &'a mut Vec<(JobId, Arc<Event>)>,
+    pub events: &'a mut Vec<(Tenant, JobId, Arc<Event>)>,
 }
 
 /// A new state, and what comes with it.
@@ -96,16 +97,18 @@ fn job_of(row: &Row<'_>) -> rusqlite::Result<Job> {
     })
 }
 
-pub(super) fn read(connection: &Connection, id: JobId) -> rusqlite::Result<Option<Job>> {
-    let query = format!("SELECT {COLUMNS} FROM jobs WHERE id = ?1");
-    connection.prepare_cached(&query)?.query_row([id.to_string()], job_of).optional()
+/// The job of that name, looked up by the index of a tenant's jobs: the row of another tenant's job is never touched.
+const OF_TENANT: &str = "jobs INDEXED BY jobs_of_tenant WHERE tenant = ?1 AND id = ?2";
+
+pub(super) fn read(connection: &Connection, tenant: &Tenant, id: JobId) -> rusqlite::Result<Option<Job>> {
+    let query = format!("SELECT {COLUMNS} FROM {OF_TENANT}");
+    connection.prepare_cached(&query)?.query_row(params![tenant.name(), id.to_string()], job_of).optional()
 }
 
 /// The request of a job, as it was stored.
-pub(super) fn spec(connection: &Connection, id: JobId) -> rusqlite::Result<Option<serde_json::Value>> {
-    let query = "SELECT spec FROM jobs WHERE id = ?1";
-    let text =
-        connection.prepare_cached(query)?.query_row([id.to_string()], |row| row.get::<_, String>(0)).optional()?;
+pub(super) fn spec(connection: &Connection, tenant: &Tenant, id: JobId) -> rusqlite::Result<Option<serde_json::Value>> {
+    let mut query = connection.prepare_cached(&format!("SELECT spec FROM {OF_TENANT}"))?;
+    let text = query.query_row(params![tenant.name(), id.to_string()], |row| row.get::<_, String>(0)).optional()?;
     text.as_deref().map(from_json).transpose()
 }
 
@@ -117,9 +120,17 @@ pub(super) fn insert(ctx: &mut Ctx<'_>, new: &NewJob) -> rusqlite::Result<()> {
         Work::Sensitivity(sensing) => to_json(&sensing.of)?,
     };
     ctx.connection.execute(
-        "INSERT INTO jobs (id, state, created_at, spec, labels, kind, settings)
-         VALUES (?1, 'queued', ?2, ?3, ?4, ?5, ?6)",
-        params![id, ctx.now, to_json(spec)?, to_json(&spec.labels)?, spec.work.kind().name(), settings],
+        "INSERT INTO jobs (id, tenant, state, created_at, spec, labels, kind, settings)
+         VALUES (?1, ?2, 'queued', ?3, ?4, ?5, ?6, ?7)",
+        params![
+            id,
+            new.tenant.name(),
+            ctx.now,
+            to_json(spec)?,
+            to_json(&spec.labels)?,
+            spec.work.kind().name(),
+            settings
+        ],
     )?;
     for (name, blob) in spec.work.held() {
         name_blob(ctx.connection, new.id, name, &blob.hex())?;
@@ -128,8 +139,8 @@ pub(super) fn insert(ctx: &mut Ctx<'_>, new: &NewJob) -> rusqlite::Result<()> {
         name_blob(ctx.connection, new.id, &name, &blob.hex())?;
     }
     for (name, value) in &spec.labels {
-        let label = "INSERT INTO labels (job, name, value) VALUES (?1, ?2, ?3)";
-        ctx.connection.execute(label, params![id, name, value])?;
+        let label = "INSERT INTO labels (tenant, job, name, value) VALUES (?1, ?2, ?3, ?4)";
+        ctx.connection.execute(label, params![new.tenant.name(), id, name, value])?;
     }
     tell_state(ctx, new.id)
 }
@@ -140,18 +151,20 @@ fn name_blob(connection: &Connection, job: JobId, name: &str, sha256: &str) -> r
     connection.execute(named, params![job.to_string(), name, sha256]).map(|_| ())
 }
 
-/// Those of these blobs that no job names; jobs that ended before `expired` do not count.
+/// Those of these blobs that no job names, of `whose` where that is given; jobs that ended before `expired` do not count.
 pub(in crate::engine) fn unnamed(
     connection: &Connection,
+    whose: Option<&Tenant>,
     mut blobs: Vec<String>,
     expired: Option<Timestamp>,
 ) -> rusqlite::Result<Vec<String>> {
     let named = "SELECT 1 FROM outputs JOIN jobs ON jobs.id = outputs.job
-                 WHERE sha256 = ?1 AND (finished_at IS NULL OR finished_at >= ?2) LIMIT 1";
+                 WHERE sha256 = ?1 AND (finished_at IS NULL OR finished_at >= ?2) AND (?3 IS NULL OR tenant = ?3)
+                 LIMIT 1";
     let (mut named, expired) = (connection.prepare_cached(named)?, expired.map_or(0, Timestamp::as_millisecond));
     let mut kept = Vec::with_capacity(blobs.len());
     for blob in &blobs {
-        kept.push(named.exists(params![blob, expired])?);
+        kept.push(named.exists(params![blob, expired, whose.map(Tenant::name)])?);
     }
     let mut kept = kept.into_iter();
     blobs.retain(|_| kept.next() == Some(false));
@@ -166,9 +179,9 @@ pub(super) fn named_blobs(connection: &Connection, job: JobId) -> rusqlite::Resu
     named.query_map([job.to_string()], |row| row.get(0))?.collect()
 }
 
-pub(in crate::engine) fn list(connection: &Connection, query: &ListQuery) -> rusqlite::Result<Page> {
-    let mut wanted = vec!["1".to_owned()];
-    let mut values: Vec<Sql> = Vec::new();
+pub(in crate::engine) fn list(connection: &Connection, tenant: &Tenant, query: &ListQuery) -> rusqlite::Result<Page> {
+    let mut wanted = vec!["tenant = ?1".to_owned()];
+    let mut values: Vec<Sql> = vec![tenant.name().to_owned().into()];
     let mut bind = |value: Sql| -> String {
         values.push(value);
         format!("?{}", values.len())
@@ -182,7 +195,7 @@ pub(in crate::engine) fn list(connection: &Connection, query: &ListQuery) -> rus
     }
     for (name, value) in &query.labels {
         let (name, value) = (bind(name.clone().into()), bind(value.clone().into()));
-        wanted.push(format!("id IN (SELECT job FROM labels WHERE name = {name} AND value = {value})"));
+        wanted.push(format!("id IN (SELECT job FROM labels WHERE tenant = ?1 AND name = {name} AND value = {value})"));
     }
     if let Some(from) = query.created_from {
         wanted.push(format!("created_at >= {}", bind(from.as_millisecond().into())));
@@ -192,7 +205,10 @@ pub(in crate::engine) fn list(connection: &Connection, query: &ListQuery) -> rus
     }
     // one more than asked for tells whether there are more
     let limit = bind(Sql::Integer(query.limit as i64 + 1));
-    let text = format!("SELECT {COLUMNS} FROM jobs WHERE {} ORDER BY id DESC LIMIT {limit}", wanted.join(" AND "));
+    let text = format!(
+        "SELECT {COLUMNS} FROM jobs INDEXED BY jobs_of_tenant WHERE {} ORDER BY id DESC LIMIT {limit}",
+        wanted.join(" AND ")
+    );
     let mut statement = connection.prepare_cached(&text)?;
     let mut jobs = statement.query_map(params_from_iter(values), job_of)?.collect::<rusqlite::Result<Vec<_>>>()?;
     let more = jobs.len() > query.limit;
@@ -224,7 +240,8 @@ pub(super) fn change(ctx: &mut Ctx<'_>, id: JobId, change: Change) -> rusqlite::
     }
     tell_state(ctx, id)?;
     if change.state.ended() {
-        let job = read(ctx.connection, id)?.ok_or(rusqlite::Error::QueryReturnedNoRows)?;
+        let query = format!("SELECT {COLUMNS} FROM jobs WHERE id = ?1");
+        let job = ctx.connection.prepare_cached(&query)?.query_row([id.to_string()], job_of)?;
         let job = serde_json::to_value(job).map_err(corrupt)?;
         append(ctx, id, EventKind::Done, job)?;
     }
@@ -251,8 +268,9 @@ pub(super) fn tell(ctx: &mut Ctx<'_>, id: JobId, update: Update) -> rusqlite::Re
 
 fn append(ctx: &mut Ctx<'_>, id: JobId, kind: EventKind, data: serde_json::Value) -> rusqlite::Result<()> {
     let text_id = id.to_string();
-    let next = "UPDATE jobs SET last_seq = last_seq + 1 WHERE id = ?1 RETURNING last_seq";
-    let seq: u64 = ctx.connection.prepare_cached(next)?.query_row([&text_id], |row| row.get(0))?;
+    let next = "UPDATE jobs SET last_seq = last_seq + 1 WHERE id = ?1 RETURNING last_seq, tenant";
+    let (seq, tenant): (u64, String) =
+        ctx.connection.prepare_cached(next)?.query_row([&text_id], |row| Ok((row.get(0)?, row.get(1)?)))?;
     ctx.connection
         .prepare_cached("INSERT INTO events (job, seq, kind, at, data) VALUES (?1, ?2, ?3, ?4, ?5)")?
         .execute(params![text_id, seq, kind.name(), ctx.now, to_json(&data)?])?;
@@ -260,20 +278,22 @@ fn append(ctx: &mut Ctx<'_>, id: JobId, kind: EventKind, data: serde_json::Value
         let old = "DELETE FROM events WHERE job = ?1 AND seq <= ?2";
         ctx.connection.prepare_cached(old)?.execute(params![text_id, seq - KEPT_EVENTS])?;
     }
-    ctx.events.push((id, Arc::new(Event { seq, kind, at: time(ctx.now)?, data })));
+    let tenant = tenant.parse().map_err(corrupt)?;
+    ctx.events.push((tenant, id, Arc::new(Event { seq, kind, at: time(ctx.now)?, data })));
     Ok(())
 }
 
 pub(in crate::engine) fn events_after(
     connection: &Connection,
+    tenant: &Tenant,
     id: JobId,
     after: u64,
     limit: usize,
 ) -> rusqlite::Result<Option<EventPage>> {
-    let query = format!("SELECT {COLUMNS} FROM jobs WHERE id = ?1");
+    let query = format!("SELECT {COLUMNS} FROM {OF_TENANT}");
     let found = connection
         .prepare_cached(&query)?
-        .query_row([id.to_string()], |row| Ok((job_of(row)?, row.get::<_, u64>(13)?)))
+        .query_row(params![tenant.name(), id.to_string()], |row| Ok((job_of(row)?, row.get::<_, u64>(13)?)))
         .optional()?;
     let Some((job, newest)) = found else { return Ok(None) };
     let oldest = "SELECT COALESCE(MIN(seq), 0) FROM events WHERE job = ?1";

@@ -4,7 +4,7 @@ use crate::engine::EngineError;
 use rusqlite::Connection;
 
 /// One step per version; `user_version` counts the steps that were taken. A step is never edited once released.
-const MIGRATIONS: [&str; 3] = [
+const MIGRATIONS: [&str; 4] = [
     "
     CREATE TABLE jobs (
         id          TEXT PRIMARY KEY,
@@ -67,6 +67,35 @@ const MIGRATIONS: [&str; 3] = [
         SELECT jobs.id, 'input:' || member.fullkey, substr(member.value, 8) FROM jobs, json_tree(jobs.spec) AS member
         WHERE member.type = 'text' AND length(member.value) = 71 AND substr(member.value, 1, 7) = 'sha256:';
 ",
+    // whose a job is; everything that was there before belongs to the default tenant
+    "
+    ALTER TABLE jobs ADD COLUMN tenant TEXT NOT NULL DEFAULT 'default';
+    CREATE UNIQUE INDEX jobs_of_tenant ON jobs (tenant, id);
+    CREATE TABLE labels_of_tenants (
+        tenant TEXT NOT NULL,
+        job    TEXT NOT NULL REFERENCES jobs (id) ON DELETE CASCADE,
+        name   TEXT NOT NULL,
+        value  TEXT NOT NULL,
+        PRIMARY KEY (tenant, name, value, job)
+    ) STRICT, WITHOUT ROWID;
+    INSERT INTO labels_of_tenants (tenant, job, name, value) SELECT 'default', job, name, value FROM labels;
+    DROP TABLE labels;
+    ALTER TABLE labels_of_tenants RENAME TO labels;
+    CREATE INDEX labels_of_job ON labels (job);
+    CREATE TABLE idempotency_of_tenants (
+        tenant      TEXT NOT NULL,
+        key         TEXT NOT NULL,
+        fingerprint TEXT NOT NULL,
+        answer      TEXT NOT NULL,
+        expires_at  INTEGER NOT NULL,
+        PRIMARY KEY (tenant, key)
+    ) STRICT;
+    INSERT INTO idempotency_of_tenants (tenant, key, fingerprint, answer, expires_at)
+        SELECT 'default', key, fingerprint, answer, expires_at FROM idempotency;
+    DROP TABLE idempotency;
+    ALTER TABLE idempotency_of_tenants RENAME TO idempotency;
+    CREATE INDEX idempotency_by_age ON idempotency (expires_at);
+",
 ];
 
 /// Brings the file to this version.
@@ -82,4 +111,30 @@ pub(in crate::engine) fn migrate(connection: &mut Connection) -> Result<(), Engi
         tx.commit()?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_file_of_an_earlier_version_holds_belongs_to_the_default_tenant() {
+        let mut connection = Connection::open_in_memory().expect("opens");
+        for step in &MIGRATIONS[..3] {
+            connection.execute_batch(step).expect("runs");
+        }
+        let old = "INSERT INTO jobs (id, state, created_at, spec, labels, settings) VALUES ('a', 'queued', 0, '{}', '{}', '{}');
+                   INSERT INTO labels VALUES ('a', 'name', 'value');
+                   INSERT INTO idempotency VALUES ('k', 'f', '{}', 9);
+                   PRAGMA user_version = 3";
+        connection.execute_batch(old).expect("writes");
+        migrate(&mut connection).expect("migrates");
+        let belongs = "SELECT (SELECT tenant FROM jobs WHERE id = 'a') = 'default'
+            AND EXISTS (SELECT 1 FROM labels WHERE tenant = 'default' AND job = 'a' AND name = 'name' AND value = 'value')
+            AND EXISTS (SELECT 1 FROM idempotency WHERE tenant = 'default' AND key = 'k' AND fingerprint = 'f')";
+        assert!(connection.query_row(belongs, [], |row| row.get::<_, bool>(0)).expect("reads"));
+        connection.execute_batch("PRAGMA foreign_keys = ON; DELETE FROM jobs WHERE id = 'a'").expect("deletes");
+        let left: u32 = connection.query_row("SELECT COUNT(*) FROM labels", [], |row| row.get(0)).expect("reads");
+        assert_eq!(left, 0, "labels go with their job");
+    }
 }

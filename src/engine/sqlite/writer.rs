@@ -3,6 +3,7 @@
 use super::records::Ctx;
 use crate::engine::EngineError;
 use crate::job::{Event, JobId};
+use crate::tenant::Tenant;
 use jiff::Timestamp;
 use rusqlite::{Connection, TransactionBehavior};
 use std::collections::HashMap;
@@ -20,33 +21,34 @@ const LIVE_EVENTS: usize = 64;
 /// Fewest senders that are worth looking through for those that nobody listens to.
 const FEWEST_TO_PRUNE: usize = 256;
 
-/// Who listens to which job.
+/// Who listens to which job. Listeners are kept by tenant and job, so that nobody hears of another tenant's.
 #[derive(Default)]
 pub(in crate::engine) struct Hub(Mutex<Listeners>);
 
 #[derive(Default)]
 struct Listeners {
-    senders: HashMap<JobId, broadcast::Sender<Arc<Event>>>,
+    senders: HashMap<(Tenant, JobId), broadcast::Sender<Arc<Event>>>,
     /// Number of senders at which the silent ones are dropped; doubles with those in use, so that subscribing stays cheap.
     prune_at: usize,
 }
 
 impl Hub {
-    pub(in crate::engine) fn subscribe(&self, id: JobId) -> broadcast::Receiver<Arc<Event>> {
+    pub(in crate::engine) fn subscribe(&self, tenant: &Tenant, id: JobId) -> broadcast::Receiver<Arc<Event>> {
         let mut hub = self.0.lock().unwrap_or_else(|e| e.into_inner());
         if hub.senders.len() >= hub.prune_at {
             hub.senders.retain(|_, sender| sender.receiver_count() > 0);
             hub.prune_at = FEWEST_TO_PRUNE.max(2 * hub.senders.len());
         }
-        hub.senders.entry(id).or_insert_with(|| broadcast::channel(LIVE_EVENTS).0).subscribe()
+        hub.senders.entry((tenant.clone(), id)).or_insert_with(|| broadcast::channel(LIVE_EVENTS).0).subscribe()
     }
 
-    fn publish(&self, events: Vec<(JobId, Arc<Event>)>) {
+    fn publish(&self, events: Vec<(Tenant, JobId, Arc<Event>)>) {
         let mut hub = self.0.lock().unwrap_or_else(|e| e.into_inner());
-        for (id, event) in events {
+        for (tenant, id, event) in events {
+            let job = (tenant, id);
             // sending fails when nobody listens any more
-            if hub.senders.get(&id).is_some_and(|sender| sender.send(event).is_err()) {
-                hub.senders.remove(&id);
+            if hub.senders.get(&job).is_some_and(|sender| sender.send(event).is_err()) {
+                hub.senders.remove(&job);
             }
         }
     }

@@ -1,11 +1,13 @@
 //! `/v1/jobs/{id}/sensitivity`: how a loss of a job's surface changes with the network that it came from.
 
 use super::{App, Problem, answer_submit, body, idempotency_key, job_id, query, surface_blob};
+use crate::auth::{Caller, Scope};
 use crate::blobs::BlobId;
 use crate::engine::{IdempotencyKey, NewJob};
 use crate::job::spec::{Sensing, Work};
 use crate::job::{Job, JobId, JobKind, JobSpec, OutputName, State as JobState};
 use crate::surface::sensitivity::check_gradient;
+use crate::tenant::Tenant;
 use axum::body::Body;
 use axum::extract::{Path, RawQuery, State};
 use axum::http::HeaderMap;
@@ -44,11 +46,13 @@ use std::collections::BTreeMap;
 )]
 pub async fn differentiate(
     State(app): State<App>,
+    caller: Caller,
     Path(id): Path<String>,
     RawQuery(raw): RawQuery,
     headers: HeaderMap,
     body: Body,
 ) -> Result<Response, Problem> {
+    let tenant = caller.may(Scope::Write)?;
     query::parameters(raw.as_deref(), &[], &[])?;
     let key = idempotency_key(&headers)?;
     let id = job_id(&id)?;
@@ -64,27 +68,27 @@ pub async fn differentiate(
     let key = key.map(|key| IdempotencyKey { key, fingerprint: format!("{id} sensitivity {hash}") });
     // a repeated request has its answer, also when the job is forgotten by now
     if let Some(key) = &key
-        && let Some(answer) = app.engine.recall(key.clone()).await?
+        && let Some(answer) = app.engine.recall(tenant, key.clone()).await?
     {
-        return answer_submit(&app, &headers, answer).await;
+        return answer_submit(&app, tenant, &headers, answer).await;
     }
     if app.stop.is_cancelled() {
         return Err(Problem::unavailable("stopping", "the service is stopping"));
     }
     // no blob goes from the moment that it is looked up until the new job's record names it
     let promise = app.blobs.promise().await;
-    let job = app.engine.get(id).await?.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
-    let mut sensing = sensing(&app, &job).await?;
-    sensing.gradient = app.blobs.put(bytes).await?;
+    let job = app.engine.get(tenant, id).await?.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
+    let mut sensing = sensing(&app, tenant, &job).await?;
+    sensing.gradient = app.blobs.put_unseen(bytes).await?;
     let outputs = OutputName::of(JobKind::Sensitivity).to_vec();
     let spec = JobSpec { work: Work::Sensitivity(Box::new(sensing)), outputs, labels: BTreeMap::new() };
-    let submitted = app.engine.submit(NewJob { id: JobId::new(), spec, key }).await?;
+    let submitted = app.engine.submit(NewJob { tenant: tenant.clone(), id: JobId::new(), spec, key }).await?;
     drop(promise);
-    answer_submit(&app, &headers, submitted).await
+    answer_submit(&app, tenant, &headers, submitted).await
 }
 
 /// What is differentiated of a job, with its surface in the place of the gradient.
-async fn sensing(app: &App, job: &Job) -> Result<Sensing, Problem> {
+async fn sensing(app: &App, tenant: &Tenant, job: &Job) -> Result<Sensing, Problem> {
     let no = |detail: &str| {
         let detail = format!("job {} {detail}", job.id);
         Problem::conflict("not_differentiable", "the job has no surface of a network", detail)
@@ -92,11 +96,11 @@ async fn sensing(app: &App, job: &Job) -> Result<Sensing, Problem> {
     if job.state != JobState::Succeeded {
         return Err(no(&format!("has not succeeded: it is {}", job.state.name())));
     }
-    let Some(Work::Shrink(work)) = app.engine.spec(job.id).await?.map(|spec| spec.work) else {
+    let Some(Work::Shrink(work)) = app.engine.spec(tenant, job.id).await?.map(|spec| spec.work) else {
         return Err(no(&format!("is of the kind {}", job.kind.name())));
     };
     let Some(input) = work.field.input else { return Err(no("is of a scene, which has no weights")) };
-    let note = app.blobs.note(input).await?.ok_or_else(|| no("is of an input that is gone"))?;
+    let note = app.blobs.note(tenant, input).await?.ok_or_else(|| no("is of an input that is gone"))?;
     if !super::inputs::read_note(&note)?.is_network() {
         return Err(no("is of a field that is no network"));
     }

@@ -7,6 +7,7 @@ use crate::job::spec::{WarmStartSpec, Work};
 use crate::job::{Job, JobSpec, State};
 use crate::shrink::Method;
 use crate::shrink::lattice::LatticeSpec;
+use crate::tenant::Tenant;
 
 const POINTER: &str = "/warm_start";
 
@@ -15,13 +16,14 @@ const POINTER: &str = "/warm_start";
 ///
 /// # Errors
 /// A problem that says what is wrong with the earlier job.
-pub async fn resolve(app: &App, spec: &mut JobSpec) -> Result<(), Problem> {
+pub async fn resolve(app: &App, tenant: &Tenant, spec: &mut JobSpec) -> Result<(), Problem> {
     let Work::Shrink(work) = &mut spec.work else { return Ok(()) };
     let Some(WarmStartSpec { job, surface }) = work.warm_start else { return Ok(()) };
     if surface.is_some() {
         return Err(refused("wrong_type", "expected the id of a job, as a string".to_owned()));
     }
-    let earlier = app.engine.get(job).await?.ok_or_else(|| refused("unknown_job", format!("there is no job {job}")))?;
+    let unknown = || refused("unknown_job", format!("there is no job {job}"));
+    let earlier = app.engine.get(tenant, job).await?.ok_or_else(unknown)?;
     let surface = surface_of(&earlier, work.shrink.lattice)
         .map_err(|(code, detail)| refused(code, format!("job {job} {detail}")))?;
     work.warm_start = Some(WarmStartSpec { job, surface: Some(surface) });

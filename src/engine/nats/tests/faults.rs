@@ -55,8 +55,8 @@ async fn a_submit_that_died_after_its_key_is_finished_by_its_repetition() {
     let keyed = || NewJob { key: Some(key.clone()), ..conformance::new_job() };
     let new = keyed();
     let dead = record::Draft::accepted(&new, now()).record.job;
-    assert!(keys::reserve(&a.node.ledger, &key, dead.clone()).await.expect("stores").is_none());
-    assert_eq!(b.recall(key.clone()).await.expect("answers"), None, "nothing was accepted yet");
+    assert!(keys::reserve(&a.node.ledger, &own(), &key, dead.clone()).await.expect("stores").is_none());
+    assert_eq!(b.recall(&own(), key.clone()).await.expect("answers"), None, "nothing was accepted yet");
     assert_eq!(b.submit(keyed()).await.expect("submits"), Submitted::Created(dead.clone()));
     assert_eq!(a.submit(keyed()).await.expect("submits"), Submitted::Replayed(dead.clone()));
     // the first one was only slow, and comes now: the very same job is there
@@ -70,8 +70,8 @@ async fn a_job_whose_request_cannot_be_read_fails_and_holds_nobody_up() {
     let a = cluster.node(CALM).await;
     let new = conformance::new_job();
     let draft = record::Draft::accepted(&new, now());
-    a.node.ledger.write(new.id, draft, Expect::Nothing).await.expect("stores").expect("is new");
-    a.node.enqueue(new.id).await;
+    a.node.ledger.write(&Name::new(&own(), new.id), draft, Expect::Nothing).await.expect("stores").expect("is new");
+    a.node.enqueue(&Name::new(&own(), new.id)).await;
     let next = submit(&a).await;
     assert_eq!(claim(&a).await.id, next);
     let failed = job(&a, new.id).await;
@@ -91,7 +91,7 @@ async fn a_job_claimed_for_a_worker_that_went_away_is_given_back() {
     let id = submit(&a).await;
     let claim = claim(&a).await;
     assert_eq!(claim.id, id);
-    assert_eq!(a.node.ledger.version(id).await.expect("reads").expect("is there").record.losses, 0);
+    assert_eq!(a.node.ledger.version(&Name::new(&own(), id)).await.expect("reads").expect("is there").record.losses, 0);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -99,7 +99,7 @@ async fn a_message_whose_first_try_was_stored_after_all_is_told_from_one_that_ca
     let Some(cluster) = Cluster::start() else { return };
     let a = cluster.node(CALM).await;
     let Ledger { link, layout, .. } = &*a.node.ledger;
-    let (subject, x) = (layout.job(JobId::new()), bytes::Bytes::from_static(b"x"));
+    let (subject, x) = (layout.job(&Name::new(&own(), JobId::new())), bytes::Bytes::from_static(b"x"));
     let store = async |expect, id, is_repetition| {
         link.store_once(&layout.jobs, &subject, &x, expect, id, is_repetition)
             .await
@@ -180,13 +180,14 @@ async fn calls_end_in_time_while_the_server_is_away_and_work_when_it_is_back() {
     eventually("it is noticed", async || a.health().await.err()).await;
     assert!(began.elapsed() < HEALTH * 2, "health took {:?}", began.elapsed());
     let began = Instant::now();
+    let own = own();
     let (submitted, read, claimed) =
-        tokio::join!(a.submit(conformance::new_job()), a.get(id), a.claim("a", 1, Duration::ZERO));
+        tokio::join!(a.submit(conformance::new_job()), a.get(&own, id), a.claim("a", 1, Duration::ZERO));
     assert!(matches!(submitted, Err(EngineError::Store(_))), "{submitted:?}");
     assert!(matches!(read, Err(EngineError::Store(_))), "{read:?}");
     assert!(claimed.is_err() || claimed.is_ok_and(|claims| claims.is_empty()));
     assert!(began.elapsed() < link::CALL * 2 + Duration::from_secs(2), "the calls took {:?}", began.elapsed());
-    assert_eq!(a.list(ListQuery { limit: 5, ..ListQuery::default() }).await.expect("lists").jobs.len(), 1);
+    assert_eq!(a.list(&own, ListQuery { limit: 5, ..ListQuery::default() }).await.expect("lists").jobs.len(), 1);
     cluster.server.restart();
     eventually("it is healthy again", async || a.health().await.ok()).await;
     assert_eq!(claim(&a).await.attempt, 1);

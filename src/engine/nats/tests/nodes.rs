@@ -23,7 +23,7 @@ fn success(sha256: &str) -> Outcome {
 }
 
 async fn all_events(engine: &Arc<NatsEngine>, id: JobId) -> Vec<Event> {
-    let stream = follow(engine.clone(), id, Some(0)).await.expect("follows").expect("is there");
+    let stream = follow(engine.clone(), &own(), id, Some(0)).await.expect("follows").expect("is there");
     let all = stream.map(|event| event.expect("reads")).collect::<Vec<_>>();
     tokio::time::timeout(PATIENCE, all).await.expect("the stream ends with the job")
 }
@@ -66,13 +66,13 @@ async fn a_job_is_seen_on_every_node_as_soon_as_it_is_accepted() {
     for _ in 0..20 {
         let id = submit(&a).await;
         assert_eq!(job(&b, id).await.state, State::Queued);
-        let page = b.events_after(id, 0, 10).await.expect("reads").expect("is there");
+        let page = b.events_after(&own(), id, 0, 10).await.expect("reads").expect("is there");
         assert_eq!(page.newest, 1);
         let newest = ListQuery { limit: 1, ..ListQuery::default() };
-        let listed = a.list(newest.clone()).await.expect("lists");
+        let listed = a.list(&own(), newest.clone()).await.expect("lists");
         assert_eq!(listed.jobs[0].id, id, "the node that accepted it lists it at once");
         eventually("the other node lists it, too", async || {
-            let listed = b.list(newest.clone()).await.expect("lists");
+            let listed = b.list(&own(), newest.clone()).await.expect("lists");
             (listed.jobs.first().map(|job| job.id) == Some(id)).then_some(())
         })
         .await;
@@ -89,7 +89,7 @@ async fn a_cancel_on_one_node_stops_a_worker_on_another() {
         let (a, claim) = (a.clone(), claim.clone());
         async move { a.interrupted(&claim).await }
     });
-    let canceling = b.request_cancel(id).await.expect("cancels").expect("is there");
+    let canceling = b.request_cancel(&own(), id).await.expect("cancels").expect("is there");
     assert_eq!(canceling.state, State::Canceling);
     let told = tokio::time::timeout(PATIENCE, told).await.expect("in time").expect("no panic");
     assert_eq!(told, Renewal::CancelRequested);
@@ -166,19 +166,27 @@ async fn a_blob_is_given_up_only_when_no_node_can_come_to_name_it() {
         let claim = claim(node).await;
         node.finish(&claim, success("shared")).await.expect("finishes");
     }
-    assert_eq!(a.forget(ended[0]).await.expect("forgets"), Forgotten::Gone(vec![]), "jobs of both nodes name it");
+    assert_eq!(
+        a.forget(&own(), ended[0]).await.expect("forgets"),
+        Forgotten::Gone(vec![]),
+        "jobs of both nodes name it"
+    );
     let running = submit(&b).await;
     let claim = claim(&b).await;
-    assert_eq!(b.forget(ended[1]).await.expect("forgets"), Forgotten::Gone(vec![]), "another job names it");
-    assert_eq!(a.forget(ended[2]).await.expect("forgets"), Forgotten::Gone(vec![]), "a running job may make it");
+    assert_eq!(b.forget(&own(), ended[1]).await.expect("forgets"), Forgotten::Gone(vec![]), "another job names it");
+    assert_eq!(
+        a.forget(&own(), ended[2]).await.expect("forgets"),
+        Forgotten::Gone(vec![]),
+        "a running job may make it"
+    );
     b.finish(&claim, success("shared")).await.expect("finishes");
-    assert_eq!(a.forget(running).await.expect("forgets"), Forgotten::Gone(vec!["shared".to_owned()]));
+    assert_eq!(a.forget(&own(), running).await.expect("forgets"), Forgotten::Gone(vec!["shared".to_owned()]));
     for id in ended.into_iter().chain([running]) {
-        assert_eq!(b.get(id).await.expect("reads"), None);
-        assert_eq!(b.events_after(id, 0, 1).await.expect("reads"), None);
+        assert_eq!(b.get(&own(), id).await.expect("reads"), None);
+        assert_eq!(b.events_after(&own(), id, 0, 1).await.expect("reads"), None);
     }
     eventually("the other node lists nothing, too", async || {
-        let listed = b.list(ListQuery { limit: 9, ..ListQuery::default() }).await.expect("lists");
+        let listed = b.list(&own(), ListQuery { limit: 9, ..ListQuery::default() }).await.expect("lists");
         listed.jobs.is_empty().then_some(())
     })
     .await;
@@ -191,10 +199,10 @@ async fn a_key_outlives_its_job() {
     let key = IdempotencyKey { key: "k".to_owned(), fingerprint: "one".to_owned() };
     let keyed = || NewJob { key: Some(key.clone()), ..conformance::new_job() };
     let Submitted::Created(job) = a.submit(keyed()).await.expect("submits") else { panic!("a new job") };
-    a.request_cancel(job.id).await.expect("cancels");
-    assert!(matches!(a.forget(job.id).await.expect("forgets"), Forgotten::Gone(_)));
+    a.request_cancel(&own(), job.id).await.expect("cancels");
+    assert!(matches!(a.forget(&own(), job.id).await.expect("forgets"), Forgotten::Gone(_)));
     assert_eq!(b.submit(keyed()).await.expect("answers"), Submitted::Replayed(job.clone()));
-    assert_eq!(b.recall(key).await.expect("answers"), Some(Submitted::Replayed(job)));
+    assert_eq!(b.recall(&own(), key).await.expect("answers"), Some(Submitted::Replayed(job)));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -204,9 +212,9 @@ async fn services_with_different_prefixes_do_not_meet() {
     let address = format!("{}?prefix=OTHER", cluster.server.url()).parse().expect("an address");
     let other = NatsEngine::open(&address, cluster.folder.path(), CALM).await.expect("opens");
     let id = submit(&a).await;
-    assert_eq!(other.get(id).await.expect("reads"), None);
+    assert_eq!(other.get(&own(), id).await.expect("reads"), None);
     assert!(other.claim("b", 1, Duration::from_millis(200)).await.expect("claims").is_empty());
-    assert!(other.list(ListQuery { limit: 1, ..ListQuery::default() }).await.expect("lists").jobs.is_empty());
+    assert!(other.list(&own(), ListQuery { limit: 1, ..ListQuery::default() }).await.expect("lists").jobs.is_empty());
     assert_eq!(claim(&a).await.id, id);
 }
 
@@ -216,23 +224,29 @@ async fn what_nobody_asks_for_any_more_is_tidied_up_and_nothing_else() {
     let a = cluster.node(CALM).await;
     let ledger = &a.node.ledger;
     let (open, ended, forgotten) = (submit(&a).await, submit(&a).await, submit(&a).await);
-    let orphan = JobId::new();
+    let orphan = Name::new(&own(), JobId::new());
     ledger
         .link
-        .store(&ledger.layout.specs, ledger.layout.spec(orphan), "{}".into(), link::Expect::Any)
+        .store(&ledger.layout.specs, ledger.layout.spec(&orphan), "{}".into(), link::Expect::Any)
         .await
         .expect("stores");
     for id in [ended, forgotten] {
-        a.request_cancel(id).await.expect("cancels");
+        a.request_cancel(&own(), id).await.expect("cancels");
     }
-    a.forget(forgotten).await.expect("forgets");
+    a.forget(&own(), forgotten).await.expect("forgets");
     let before = all_events(&a, ended).await;
     assert_eq!(before.len(), 3, "queued, canceled, done");
 
     let later = |days: i64| jiff::Timestamp::now() + jiff::SignedDuration::from_hours(24 * days + 1);
     let entries = async |id| {
-        let mut info =
-            ledger.layout.jobs.info_builder().subjects(ledger.layout.job(id)).fetch().await.expect("is there");
+        let mut info = ledger
+            .layout
+            .jobs
+            .info_builder()
+            .subjects(ledger.layout.job(&Name::new(&own(), id)))
+            .fetch()
+            .await
+            .expect("is there");
         info.next().await.map_or(0, |found| found.expect("reads").1)
     };
     housekeeping::tidy(ledger, later(0)).await.expect("tidies");
@@ -241,8 +255,10 @@ async fn what_nobody_asks_for_any_more_is_tidied_up_and_nothing_else() {
     assert_eq!((entries(open).await, entries(ended).await, entries(forgotten).await), (1, 1, 1));
     housekeeping::tidy(ledger, later(2)).await.expect("tidies");
     assert_eq!((entries(open).await, entries(ended).await, entries(forgotten).await), (1, 1, 0));
-    assert_eq!(ledger.request(orphan).await.expect("reads"), None);
-    assert!(a.spec(open).await.expect("reads").is_some() && a.spec(ended).await.expect("reads").is_some());
+    assert_eq!(ledger.request(&orphan).await.expect("reads"), None);
+    assert!(
+        a.spec(&own(), open).await.expect("reads").is_some() && a.spec(&own(), ended).await.expect("reads").is_some()
+    );
     let after = all_events(&a, ended).await;
     assert_eq!(after.iter().map(|e| e.kind).collect::<Vec<_>>(), [EventKind::Snapshot, EventKind::Done]);
     assert_eq!(after.last(), before.last());
