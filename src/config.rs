@@ -17,6 +17,10 @@ use std::path::{Path, PathBuf};
 pub struct Config {
     /// Address to listen on (`SHRINKD_LISTEN`). Loopback, because there is no authentication.
     pub listen: SocketAddr,
+    /// Address to serve `/metrics` at, and nothing else (`SHRINKD_METRICS_LISTEN`); empty serves it at `listen`. Nobody is asked for a
+    /// key there.
+    #[serde(with = "unless_empty")]
+    pub metrics_listen: Option<SocketAddr>,
     /// Folder of the database and the blobs (`SHRINKD_DATA_DIR`), made when it is not there.
     pub data_dir: PathBuf,
     /// Where jobs are kept (`SHRINKD_ENGINE`): `sqlite`, in the folder and for one process; or the
@@ -123,6 +127,7 @@ impl Default for Config {
     fn default() -> Self {
         Self {
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
+            metrics_listen: None,
             data_dir: PathBuf::from("./shrinkd-data"),
             engine: SQLITE.to_owned(),
             cors_origins: Vec::new(),
@@ -178,6 +183,27 @@ impl Config {
             config.engine.parse::<Address>()?;
         }
         Ok(config)
+    }
+}
+
+/// A value that may be left out: TOML and the environment say so with an empty text.
+mod unless_empty {
+    use serde::{Deserialize, Deserializer, Serializer, de::Error};
+    use std::fmt::Display;
+    use std::str::FromStr;
+
+    pub fn serialize<T: Display, S: Serializer>(value: &Option<T>, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(&value.as_ref().map(ToString::to_string).unwrap_or_default())
+    }
+
+    pub fn deserialize<'de, T, D>(deserializer: D) -> Result<Option<T>, D::Error>
+    where
+        T: FromStr<Err: Display>,
+        D: Deserializer<'de>,
+    {
+        let text = String::deserialize(deserializer)?;
+        let parsed = (!text.is_empty()).then(|| text.parse()).transpose();
+        parsed.map_err(|error| D::Error::custom(format!("{text:?}: {error}")))
     }
 }
 

@@ -7,10 +7,13 @@
 //! old events are kept (a reader that comes too late gets a fresh snapshot).
 
 pub mod conformance;
+mod measured;
 pub mod nats;
 pub mod sqlite;
 
-use crate::job::{Event, EventKind, Failure, Job, JobId, JobSpec, Output, ProgressView, State};
+pub use measured::Measured;
+
+use crate::job::{Event, EventKind, Failure, Job, JobId, JobKind, JobSpec, Output, ProgressView, State};
 use futures::stream::BoxStream;
 use jiff::Timestamp;
 use std::collections::VecDeque;
@@ -173,6 +176,19 @@ impl Outcome {
     }
 }
 
+/// How much there is to do.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Depth {
+    /// How many jobs there are of a kind in a state; only of those that have not ended, and only where there are any.
+    pub open: Vec<(JobKind, State, u64)>,
+    /// When the oldest job that is queued was accepted.
+    pub oldest_queued: Option<Timestamp>,
+    /// Whether the engine is connected to where the jobs are kept.
+    pub connected: bool,
+    /// Changes of other nodes that this one has not read yet.
+    pub lag: u64,
+}
+
 /// What an engine can fail with. The text is for the log, not for clients.
 #[derive(Debug, thiserror::Error)]
 pub enum EngineError {
@@ -230,6 +246,8 @@ pub trait Engine: Send + Sync {
     async fn events_after(&self, id: JobId, after: u64, limit: usize) -> Result<Option<EventPage>, EngineError>;
     /// The job's events from now on. Every change of a record is told by an event.
     fn changes(&self, id: JobId) -> Changes;
+    /// How much there is to do, as this node sees it.
+    async fn depth(&self) -> Result<Depth, EngineError>;
     /// Whether the engine can do its work.
     async fn health(&self) -> Result<(), EngineError>;
 }

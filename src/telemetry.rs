@@ -1,4 +1,8 @@
-//! The log: structured lines on standard error, with the request's and the job's id on each.
+//! What an operator sees of a running service. Here the log: structured lines on standard error, with the request's and the job's
+//! id on each; beside it the [metrics].
+
+pub mod metrics;
+mod process;
 
 use crate::config::{LogConfig, LogFormat};
 use std::io::IsTerminal;

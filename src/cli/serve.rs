@@ -8,6 +8,7 @@ use crate::http::{self, App};
 use crate::job::collector;
 use crate::job::worker::Worker;
 use crate::telemetry;
+use crate::telemetry::metrics::{self, Exposition};
 use serde::Serialize;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -90,6 +91,7 @@ async fn open_blobs(config: &Config) -> Result<Blobs, Box<dyn std::error::Error>
 }
 
 async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std::error::Error>> {
+    let exposition = Exposition::start()?;
     let engine = open_engine(&config).await?;
     let blobs = open_blobs(&config).await?;
     let pool = rayon::ThreadPoolBuilder::new()
@@ -103,6 +105,9 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
     let address = listener.local_addr()?;
     if !address.ip().is_loopback() {
         tracing::warn!("listening beyond loopback without authentication: whoever reaches this address can use it");
+    }
+    if config.role != Role::Api {
+        metrics::worker_started(config.worker.slots, pool.current_num_threads());
     }
     let (engine_of_worker, blobs_of_worker) = (engine.clone(), blobs.clone());
     let worker = move || Worker {
@@ -120,8 +125,15 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
         limits: config.limits.clone(),
         retention: config.retention,
         download_link: Duration::from_secs(config.download_link_s),
+        metrics: exposition,
+        metrics_apart: config.metrics_listen.is_some(),
         stop: stop.clone(),
     };
+    if let Some(address) = config.metrics_listen {
+        let (listener, router) = (TcpListener::bind(address).await?, http::metrics::router(app.clone()));
+        tracing::info!(http.address = %listener.local_addr()?, "serving metrics");
+        tokio::spawn(axum::serve(listener, router).into_future());
+    }
     let router = match config.role {
         Role::Worker => http::health_router(app),
         Role::All | Role::Api => http::router(app, &config.cors_origins),

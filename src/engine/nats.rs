@@ -36,7 +36,7 @@ mod tests;
 pub use address::{Address, InvalidAddress, SCHEMES};
 
 use super::{
-    Changes, Claim, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Page,
+    Changes, Claim, Depth, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Page,
     Renewal, Submitted, Terms, Update,
 };
 use crate::job::{Job, JobId, JobSpec, State};
@@ -248,6 +248,14 @@ impl Node {
         Ok(projection.events_after(id, after, limit).await?.map(|(page, _)| page))
     }
 
+    /// The servers are asked for the number of the newest entry only; the counts are this node's own.
+    async fn depth(&self) -> Result<Depth, EngineError> {
+        let newest = tokio::time::timeout(HEALTH, self.ledger.layout.jobs.get_info()).await.ok().and_then(Result::ok);
+        let (open, oldest_queued) = self.ledger.projection.depth().await?;
+        let lag = newest.as_ref().map_or(0, |info| info.state.last_sequence.saturating_sub(self.feed.position()));
+        Ok(Depth { open, oldest_queued, connected: newest.is_some(), lag })
+    }
+
     async fn health(&self) -> Result<(), EngineError> {
         if !self.ledger.link.is_up() {
             return Err(EngineError::Store("there is no connection to the cluster".to_owned()));
@@ -348,6 +356,10 @@ impl Engine for NatsEngine {
 
     fn changes(&self, id: JobId) -> Changes {
         Changes(self.node.ledger.projection.subscribe(id))
+    }
+
+    async fn depth(&self) -> Result<Depth, EngineError> {
+        patiently(self.node.depth()).await
     }
 
     async fn health(&self) -> Result<(), EngineError> {

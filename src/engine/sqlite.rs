@@ -12,10 +12,11 @@ pub(super) mod writer;
 pub(super) use readers::Readers;
 
 use super::{
-    Changes, Claim, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Page,
+    Changes, Claim, Depth, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Page,
     Renewal, Submitted, Terms, Update,
 };
 use crate::job::{Failure, Job, JobId, JobSpec, State};
+use crate::telemetry::metrics;
 use jiff::Timestamp;
 use records::{Change, Ctx};
 use rusqlite::{Connection, OptionalExtension, params};
@@ -61,6 +62,7 @@ impl SqliteEngine {
         let hub = Arc::new(Hub::default());
         let lost = writer::once(&mut connection, &hub, |ctx| records::requeue_lost(ctx, i64::MAX, terms.max_losses))?;
         if lost > 0 {
+            metrics::attempts_lost(lost as u64);
             tracing::warn!(jobs = lost, "jobs of an earlier process are taken up again");
         }
         let writer = Writer::start(connection, hub.clone())?;
@@ -251,6 +253,11 @@ impl Engine for SqliteEngine {
         Changes(self.hub.subscribe(id))
     }
 
+    async fn depth(&self) -> Result<Depth, EngineError> {
+        let (open, oldest_queued) = self.read(records::depth).await?;
+        Ok(Depth { open, oldest_queued, connected: true, lag: 0 })
+    }
+
     async fn health(&self) -> Result<(), EngineError> {
         self.write(|ctx| ctx.connection.query_row("SELECT 1", [], |_| Ok(()))).await
     }
@@ -288,7 +295,8 @@ fn submit(ctx: &mut Ctx<'_>, new: &NewJob) -> rusqlite::Result<Submitted> {
 }
 
 fn claim(ctx: &mut Ctx<'_>, worker: &str, slots: usize, terms: Terms) -> rusqlite::Result<Vec<Claim>> {
-    records::requeue_lost(ctx, ctx.now, terms.max_losses)?;
+    let lost = records::requeue_lost(ctx, ctx.now, terms.max_losses)?;
+    metrics::attempts_lost(lost as u64);
     let mut claims = Vec::new();
     while claims.len() < slots {
         let until = ctx.now.saturating_add(terms.lease.as_millis() as i64);

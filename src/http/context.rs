@@ -1,6 +1,7 @@
 //! What every request gets: an id, a span, one line in the log, and a problem document when it fails.
 
 use super::problem::{self, Problem};
+use crate::telemetry::metrics;
 use axum::extract::{MatchedPath, Request};
 use axum::http::{HeaderName, HeaderValue};
 use axum::middleware::Next;
@@ -18,7 +19,7 @@ pub async fn request(mut request: Request, next: Next) -> Response {
     let id = request_id(&request);
     let route = request.extensions().get::<MatchedPath>().map_or("", |path| path.as_str()).to_owned();
     let span = tracing::info_span!("request", request.id = %id, http.method = %request.method(), http.path = request.uri().path());
-    let clock = Instant::now();
+    let (clock, method) = (Instant::now(), request.method().clone());
     let id_header = HeaderValue::from_str(&id).unwrap_or_else(|_| HeaderValue::from_static("invalid"));
     request.headers_mut().insert(REQUEST_ID, id_header.clone());
     async move {
@@ -34,7 +35,9 @@ pub async fn request(mut request: Request, next: Next) -> Response {
             response
         };
         response.headers_mut().insert(REQUEST_ID, id_header);
-        let elapsed_ms = clock.elapsed().as_secs_f64() * 1e3;
+        let elapsed = clock.elapsed();
+        metrics::request_answered(&method, &route, status.as_u16(), elapsed);
+        let elapsed_ms = elapsed.as_secs_f64() * 1e3;
         tracing::info!(http.status = status.as_u16(), http.route = route, elapsed_ms, "request answered");
         response
     }

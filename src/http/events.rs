@@ -4,6 +4,7 @@ use super::jobs::job_id;
 use super::{App, Problem, query};
 use crate::engine;
 use crate::job::{Event, JobId};
+use crate::telemetry::metrics::{self, Present};
 use axum::Json;
 use axum::extract::{Path, RawQuery, State};
 use axum::http::{HeaderMap, HeaderName, StatusCode, header};
@@ -96,8 +97,11 @@ async fn stream(app: App, id: JobId, after: Option<u64>) -> Result<Response, Pro
         }
     }
     let events = engine::follow(app.engine, id, after).await?.ok_or_else(unknown)?;
+    let client = Present::sse_client();
     let frames = events.enumerate().map(move |(i, event)| {
+        let _here = &client;
         let event = event.inspect_err(|error| tracing::error!(job.id = %id, %error, "a stream broke off"))?;
+        metrics::event_sent(event.kind.name());
         let frame =
             sse::Event::default().id(event.seq.to_string()).event(event.kind.name()).data(event.data.to_string());
         Ok::<_, engine::EngineError>(if i == 0 { frame.retry(RETRY) } else { frame })

@@ -6,6 +6,7 @@ use crate::field::FieldError;
 use crate::field::input::{Description, FieldOptions};
 use crate::field::network::family::Family;
 use crate::job::{Failure, pipeline, spec};
+use crate::telemetry::metrics;
 use axum::Json;
 use axum::body::Body;
 use axum::extract::{Path, RawQuery, State};
@@ -97,6 +98,7 @@ fn says_nothing(options: &FieldOptions) -> bool {
 pub async fn upload(State(app): State<App>, RawQuery(raw): RawQuery, body: Body) -> Result<Response, Problem> {
     let options = reading_options(raw.as_deref())?;
     let bytes = body::read(body, app.limits.input_bytes).await?;
+    metrics::uploaded(bytes.len() as u64);
     let hashed = bytes.clone();
     let id = tokio::task::spawn_blocking(move || BlobId::of(&hashed)).await.map_err(joined)?;
     if let Some(mut known) = known(&app, id).await? {

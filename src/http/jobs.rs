@@ -11,13 +11,14 @@ use crate::field::{Fault, FieldError};
 use crate::job::spec::{FieldSpec, Fitting, Work};
 use crate::job::{Failure, Job, JobId, JobKind, JobSpec, OutputName, pipeline};
 use crate::shrink::Method;
+use crate::telemetry::metrics;
 use axum::Json;
 use axum::body::Body;
 use axum::extract::{Path, RawQuery, State};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// Characters of an idempotency key.
 const MAX_KEY: usize = 255;
@@ -77,6 +78,7 @@ pub async fn submit(
     headers: HeaderMap,
     body: Body,
 ) -> Result<Response, Problem> {
+    let clock = Instant::now();
     let parameters = query::parameters(raw.as_deref(), &["validate_only"], &[])?;
     let validate_only = query::flag(&parameters, "validate_only")?;
     let key = idempotency_key(&headers)?;
@@ -111,7 +113,15 @@ pub async fn submit(
     }
     let submitted = app.engine.submit(NewJob { id: JobId::new(), spec, key }).await?;
     drop(promise);
+    tell_accepted(&submitted, clock);
     answer_submit(&app, &headers, submitted).await
+}
+
+/// Counts a job that is new.
+fn tell_accepted(submitted: &Submitted, since: Instant) {
+    if let Submitted::Created(job) = submitted {
+        metrics::job_accepted(job.kind, since.elapsed());
+    }
 }
 
 /// The answer to a submit, after the wait that `Prefer` asks for.

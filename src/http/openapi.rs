@@ -1,5 +1,7 @@
 //! The description of the service, made from the handlers.
 
+mod links;
+
 use super::problem::ProblemDocument;
 use axum::Json;
 use utoipa::openapi::content::ContentBuilder;
@@ -37,7 +39,7 @@ pub(super) fn base() -> OpenApi {
     Base::openapi()
 }
 
-/// Gives every problem its body, and every operation the problems that any of them can have.
+/// Gives every problem its body, every operation the problems that any of them can have, and answers the links to what follows them.
 pub(super) fn complete(mut document: OpenApi) -> OpenApi {
     for item in document.paths.paths.values_mut() {
         let operations =
@@ -50,6 +52,7 @@ pub(super) fn complete(mut document: OpenApi) -> OpenApi {
             head.operation_id = head.operation_id.take().map(|id| format!("{id}_head"));
         }
     }
+    links::add(&mut document);
     document
 }
 

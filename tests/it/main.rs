@@ -14,6 +14,7 @@ mod faults;
 mod fit;
 mod losses;
 mod metrics;
+mod monitoring;
 mod reading;
 mod refusals;
 mod relaxed;

@@ -1,6 +1,6 @@
 //! `/v1/jobs/{id}/sensitivity`: how a loss of a job's surface changes with the network that it came from.
 
-use super::{App, Problem, answer_submit, body, idempotency_key, job_id, query, surface_blob};
+use super::{App, Problem, answer_submit, body, idempotency_key, job_id, query, surface_blob, tell_accepted};
 use crate::blobs::BlobId;
 use crate::engine::{IdempotencyKey, NewJob};
 use crate::job::spec::{Sensing, Work};
@@ -11,6 +11,7 @@ use axum::extract::{Path, RawQuery, State};
 use axum::http::HeaderMap;
 use axum::response::Response;
 use std::collections::BTreeMap;
+use std::time::Instant;
 
 /// Differentiates a job's surface
 ///
@@ -49,6 +50,7 @@ pub async fn differentiate(
     headers: HeaderMap,
     body: Body,
 ) -> Result<Response, Problem> {
+    let clock = Instant::now();
     query::parameters(raw.as_deref(), &[], &[])?;
     let key = idempotency_key(&headers)?;
     let id = job_id(&id)?;
@@ -80,6 +82,7 @@ pub async fn differentiate(
     let spec = JobSpec { work: Work::Sensitivity(Box::new(sensing)), outputs, labels: BTreeMap::new() };
     let submitted = app.engine.submit(NewJob { id: JobId::new(), spec, key }).await?;
     drop(promise);
+    tell_accepted(&submitted, clock);
     answer_submit(&app, &headers, submitted).await
 }
 
