@@ -1,8 +1,8 @@
 //! Submits at a steady rate while the pool is saturated.
 
+use crate::Load;
 use crate::client::{cancel, client, endless, percentile, running, small, submit};
 use crate::service::Outcome;
-use crate::Load;
 use std::time::{Duration, Instant};
 
 /// Submits in a second, whether or not earlier ones were answered.

@@ -1,8 +1,8 @@
 //! Many open streams on few running jobs.
 
+use crate::Load;
 use crate::client::{cancel, client, endless, follow, percentile, running, small, submit};
 use crate::service::Outcome;
-use crate::Load;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};

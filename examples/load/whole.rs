@@ -1,8 +1,8 @@
 //! Clients that submit, follow and download, one job after the other.
 
+use crate::Load;
 use crate::client::{client, download, follow, percentile, small, submit};
 use crate::service::Outcome;
-use crate::Load;
 use std::time::{Duration, Instant};
 
 /// How long accepting took, and how long everything.

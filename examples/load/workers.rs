@@ -1,8 +1,8 @@
 //! The same heap of jobs for one, two and three worker processes on one cluster.
 
+use crate::Load;
 use crate::client::{client, follow, small, submit};
 use crate::service::Outcome;
-use crate::Load;
 use std::time::Instant;
 
 /// Jobs of the heap.
@@ -17,7 +17,8 @@ pub async fn measure(load: &Load) -> Outcome<()> {
     for count in 1..=MOST {
         let folder = tempfile::tempdir()?;
         let variables = |role: &str| {
-            let prefix = format!("{}?prefix=LOAD{count}", load.server.as_ref().map(|server| server.url()).unwrap_or_default());
+            let prefix =
+                format!("{}?prefix=LOAD{count}", load.server.as_ref().map(|server| server.url()).unwrap_or_default());
             [
                 ("SHRINKD_ENGINE", prefix),
                 ("SHRINKD_ROLE", role.to_owned()),

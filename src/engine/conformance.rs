@@ -8,8 +8,8 @@
 //! ```
 
 use super::{
-    Claim, Depth, Engine, EngineError, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Renewal, Submitted, Update,
-    follow,
+    Claim, Depth, Engine, EngineError, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Renewal, Submitted,
+    Update, follow,
 };
 use crate::blobs::BlobId;
 use crate::job::spec::{WarmStartSpec, Work};

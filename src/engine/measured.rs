@@ -14,10 +14,7 @@ use std::time::{Duration, Instant};
 /// Passes everything on to another engine.
 pub struct Measured(pub Arc<dyn Engine>);
 
-async fn timed<T>(
-    call: &'static str,
-    work: impl Future<Output = Result<T, EngineError>>,
-) -> Result<T, EngineError> {
+async fn timed<T>(call: &'static str, work: impl Future<Output = Result<T, EngineError>>) -> Result<T, EngineError> {
     let clock = Instant::now();
     let result = work.await;
     let outcome = match &result {

@@ -336,7 +336,9 @@ impl Worker {
                         Outcome::Canceled => ("canceled", ""),
                         Outcome::Released => ("released", ""),
                     };
-                    if let Outcome::Succeeded { metrics, .. } | Outcome::Failed { metrics: Some(metrics), .. } = &outcome {
+                    if let Outcome::Succeeded { metrics, .. } | Outcome::Failed { metrics: Some(metrics), .. } =
+                        &outcome
+                    {
                         metrics::job_reported(metrics);
                     }
                     tracing::info!(job.outcome = ended, problem.code = code, "job ended");

@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 use tokio::sync::Mutex;
 
 /// How a metric behaves.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Kind {
     /// Only grows, from 0 at the start of the process.
     Counter,
@@ -68,27 +68,59 @@ const BUILD: &str = "shrinkd_build_info";
 /// Every metric of the service.
 pub const ALL: &[Metric] = &[
     Metric { name: JOBS, kind: Kind::Gauge, help: "Jobs that have not ended, in the whole service, by kind and state" },
-    Metric { name: OLDEST, kind: Kind::Gauge, help: "Time since the oldest job that is queued was accepted; 0 when none is" },
-    Metric { name: CONNECTED, kind: Kind::Gauge, help: "Whether the engine answered this node at the last look (1) or not (0)" },
-    Metric { name: LAG, kind: Kind::Gauge, help: "Entries of the cluster that this node has not read yet; always 0 for sqlite" },
-    Metric { name: ACCEPT, kind: SHORT, help: "Time from a request for a new job to the moment that the job is durable, by kind" },
+    Metric {
+        name: OLDEST,
+        kind: Kind::Gauge,
+        help: "Time since the oldest job that is queued was accepted; 0 when none is",
+    },
+    Metric {
+        name: CONNECTED,
+        kind: Kind::Gauge,
+        help: "Whether the engine answered this node at the last look (1) or not (0)",
+    },
+    Metric {
+        name: LAG,
+        kind: Kind::Gauge,
+        help: "Entries of the cluster that this node has not read yet; always 0 for sqlite",
+    },
+    Metric {
+        name: ACCEPT,
+        kind: SHORT,
+        help: "Time from a request for a new job to the moment that the job is durable, by kind",
+    },
     Metric { name: WAIT, kind: LONG, help: "Time from the acceptance of a job to its first start, by kind" },
     Metric { name: RUN, kind: LONG, help: "Time of an attempt from claim to end, by kind and outcome" },
     Metric { name: LOST, kind: Kind::Counter, help: "Attempts whose worker this node found lost" },
-    Metric { name: EVALUATIONS, kind: Kind::Counter, help: "Evaluations of fields by jobs that ended here, by what was asked for" },
+    Metric {
+        name: EVALUATIONS,
+        kind: Kind::Counter,
+        help: "Evaluations of fields by jobs that ended here, by what was asked for",
+    },
     Metric { name: VERTICES, kind: Kind::Counter, help: "Vertices of the surfaces and curves that were made here" },
     Metric { name: RUNNING, kind: Kind::Gauge, help: "Jobs that this node runs now" },
     Metric { name: SLOTS, kind: Kind::Gauge, help: "Jobs that this node runs at most" },
     Metric { name: THREADS, kind: Kind::Gauge, help: "Threads of the pool that this node's jobs share" },
     Metric { name: REQUESTS, kind: Kind::Counter, help: "Requests that were answered, by method, route and status" },
-    Metric { name: REQUEST_DURATION, kind: SHORT, help: "Time to the head of the answer, by method and route; a wait that the client asked for is part of it" },
+    Metric {
+        name: REQUEST_DURATION,
+        kind: SHORT,
+        help: "Time to the head of the answer, by method and route; a wait that the client asked for is part of it",
+    },
     Metric { name: SSE_CLIENTS, kind: Kind::Gauge, help: "Streams of events that are open now" },
     Metric { name: SSE_EVENTS, kind: Kind::Counter, help: "Events that were sent on streams, by type" },
     Metric { name: UPLOADED, kind: Kind::Counter, help: "Bytes of inputs that were uploaded" },
     Metric { name: DOWNLOADED, kind: Kind::Counter, help: "Bytes of outputs that were sent, by output" },
-    Metric { name: BLOB_DURATION, kind: SHORT, help: "Time of an operation on the blob store, by operation and outcome" },
+    Metric {
+        name: BLOB_DURATION,
+        kind: SHORT,
+        help: "Time of an operation on the blob store, by operation and outcome",
+    },
     Metric { name: ENGINE_DURATION, kind: SHORT, help: "Time of a call of the engine, by call and outcome" },
-    Metric { name: COLLECTED, kind: Kind::Counter, help: "Blobs that this node removed because no job names them any more" },
+    Metric {
+        name: COLLECTED,
+        kind: Kind::Counter,
+        help: "Blobs that this node removed because no job names them any more",
+    },
     Metric { name: BUILD, kind: Kind::Gauge, help: "Always 1, with the version of the program" },
 ];
 
@@ -130,17 +162,17 @@ impl Exposition {
         gauge!(BUILD, "version" => env!("CARGO_PKG_VERSION")).set(1.0);
         // what may never happen is there from the start, so that its rate is known
         for kind in JobKind::ALL {
-            histogram!(ACCEPT, "kind" => kind.name());
-            histogram!(WAIT, "kind" => kind.name());
+            let _ = histogram!(ACCEPT, "kind" => kind.name());
+            let _ = histogram!(WAIT, "kind" => kind.name());
             for outcome in OUTCOMES {
-                histogram!(RUN, "kind" => kind.name(), "outcome" => outcome);
+                let _ = histogram!(RUN, "kind" => kind.name(), "outcome" => outcome);
             }
         }
         for asked in EVALUATED {
-            counter!(EVALUATIONS, "of" => asked);
+            let _ = counter!(EVALUATIONS, "of" => asked);
         }
         for name in [LOST, VERTICES, UPLOADED, COLLECTED] {
-            counter!(name);
+            let _ = counter!(name);
         }
         for name in [RUNNING, SLOTS, THREADS, SSE_CLIENTS] {
             gauge!(name).set(0.0);
@@ -321,7 +353,10 @@ mod tests {
     fn names_follow_the_conventions_of_prometheus() {
         for metric in ALL {
             let name = metric.name;
-            assert!(name.starts_with("shrinkd_") && name.bytes().all(|b| b.is_ascii_lowercase() || b == b'_'), "{name}");
+            assert!(
+                name.starts_with("shrinkd_") && name.bytes().all(|b| b.is_ascii_lowercase() || b == b'_'),
+                "{name}"
+            );
             assert_eq!(metric.kind == Kind::Counter, name.ends_with("_total"), "{name}");
             assert!(!matches!(metric.kind, Kind::Histogram(_)) || name.ends_with("_seconds"), "{name}");
         }

@@ -201,7 +201,9 @@ pub(in crate::engine) fn list(connection: &Connection, query: &ListQuery) -> rus
 }
 
 /// How many jobs there are of each kind in each state that is no end, and when the oldest queued one was accepted.
-pub(in crate::engine) fn depth(connection: &Connection) -> rusqlite::Result<(Vec<(JobKind, State, u64)>, Option<Timestamp>)> {
+pub(in crate::engine) fn depth(
+    connection: &Connection,
+) -> rusqlite::Result<(Vec<(JobKind, State, u64)>, Option<Timestamp>)> {
     let text = "SELECT kind, state, COUNT(*), MIN(created_at) FROM jobs
                 WHERE state IN ('queued', 'running', 'canceling') GROUP BY kind, state";
     let mut statement = connection.prepare_cached(text)?;

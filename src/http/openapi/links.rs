@@ -87,7 +87,8 @@ mod tests {
     fn every_way_begins_and_ends_at_an_operation() {
         let document = serde_json::to_value(crate::http::document()).expect("JSON");
         let operations = document["paths"].as_object().expect("paths").values();
-        let operations: Vec<&Value> = operations.flat_map(|item| item.as_object().expect("operations").values()).collect();
+        let operations: Vec<&Value> =
+            operations.flat_map(|item| item.as_object().expect("operations").values()).collect();
         let named = |name: &str| operations.iter().find(|operation| operation["operationId"] == name);
         let jobs = JOBS.iter().flat_map(|(from, statuses)| OF_A_JOB.map(|to| (*from, *statuses, to)));
         let inputs = INPUTS.iter().map(|(from, statuses)| (*from, *statuses, "submit"));
