@@ -49,8 +49,8 @@ pub struct EventsPage {
     params(
         ("id" = String, Path, description = "the job"),
         ("after" = Option<u64>, Query, description = "only events after this number"),
-        ("limit" = Option<u64>, Query, description = "events of a JSON page, 1 to 512"),
-        ("Last-Event-ID" = Option<String>, Header, description = "the last number that was seen; goes before `after`"),
+        ("limit" = Option<u64>, Query, minimum = 1, maximum = 512, description = "events of a JSON page, 1 to 512"),
+        ("Last-Event-ID" = Option<String>, Header, pattern = "^[0-9]{0,19}$", description = "the last number that was seen; goes before `after`"),
     ),
     responses(
         (status = 200, description = "the events", content((String = "text/event-stream"), (EventsPage = "application/json"))),

@@ -54,7 +54,7 @@ pub struct Estimate {
     tag = "jobs",
     params(
         ("validate_only" = Option<bool>, Query, description = "check the request and estimate its cost, without submitting it"),
-        ("Idempotency-Key" = Option<String>, Header, description = "makes the submit repeatable for 24 hours"),
+        ("Idempotency-Key" = Option<String>, Header, min_length = 1, max_length = 255, pattern = "^[!-~]+$", description = "makes the submit repeatable for 24 hours"),
         ("Prefer" = Option<String>, Header, description = "`wait=N`: wait up to N seconds for the end"),
     ),
     request_body(content = JobRequest, content_type = "application/json"),

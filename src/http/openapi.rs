@@ -1,6 +1,7 @@
 //! The description of the service, made from the handlers.
 
 mod links;
+mod scene;
 
 use super::problem::ProblemDocument;
 use axum::Json;
@@ -53,6 +54,7 @@ pub(super) fn complete(mut document: OpenApi) -> OpenApi {
         }
     }
     links::add(&mut document);
+    scene::add(&mut document);
     document
 }
 

@@ -128,3 +128,74 @@ async fn metrics_may_be_served_apart() {
     assert_eq!(app.client.get(format!("{apart}/v1/jobs")).send().await.expect("an answer").status(), 404);
     crate::app::problem(app.get("/metrics").await, 404, "unknown_route").await;
 }
+
+/// A file of the repository.
+fn file(path: &str) -> String {
+    std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).expect("reads")
+}
+
+/// The metrics that a text names.
+fn named(text: &str) -> BTreeSet<String> {
+    let words = text.split(|c: char| !c.is_ascii_alphanumeric() && c != '_');
+    words.filter(|word| word.starts_with("shrinkd_") || word.starts_with("process_")).map(str::to_owned).collect()
+}
+
+#[test]
+fn the_dashboard_and_the_alarms_know_only_metrics_that_there_are() {
+    let mut known = BTreeSet::new();
+    for (name, kind) in documented() {
+        match kind.as_str() {
+            "histogram" => known.extend(["_bucket", "_sum", "_count"].map(|series| format!("{name}{series}"))),
+            _ => drop(known.insert(name)),
+        }
+    }
+    let dashboard: serde_json::Value = serde_json::from_str(&file("docker/grafana/shrinkd.json")).expect("JSON");
+    let mut shown = BTreeSet::new();
+    let panels = dashboard["panels"].as_array().expect("panels");
+    let targets = panels.iter().filter(|panel| panel["type"] != "row");
+    for target in targets.flat_map(|panel| panel["targets"].as_array().expect("targets")) {
+        let metrics = named(target["expr"].as_str().expect("an expression"));
+        assert!(!metrics.is_empty(), "{target}");
+        shown.extend(metrics);
+    }
+    assert_eq!(shown.difference(&known).collect::<Vec<_>>(), Vec::<&String>::new(), "on the dashboard");
+    // every one of them is worth a look
+    let unseen: Vec<_> = documented()
+        .into_iter()
+        .filter(|(name, _)| !shown.iter().any(|series| series.strip_prefix(name.as_str()).is_some_and(is_series)))
+        .collect();
+    assert_eq!(unseen, [], "not on the dashboard");
+    let alarms = file("docker/prometheus/alerts.yml");
+    assert_eq!(named(&alarms).difference(&known).collect::<Vec<_>>(), Vec::<&String>::new(), "in the alarms");
+}
+
+fn is_series(suffix: &str) -> bool {
+    ["", "_bucket", "_sum", "_count"].contains(&suffix)
+}
+
+#[test]
+fn every_alarm_and_every_warning_at_the_start_says_what_to_do() {
+    let documented = file("docs/operations.md");
+    let alarms = file("docker/prometheus/alerts.yml");
+    let names: Vec<&str> = alarms.lines().filter_map(|line| line.trim().strip_prefix("- alert: ")).collect();
+    assert!(names.len() > 10, "{names:?}");
+    for name in names {
+        assert!(documented.contains(&format!("\n| `{name}` | ")), "{name} is not in docs/operations.md");
+    }
+    let mut warnings = 0;
+    for path in ["src/cli/serve.rs", "src/engine/nats.rs", "src/engine/nats/link.rs", "src/engine/nats/layout.rs"] {
+        for call in file(path).split("warn!(").skip(1) {
+            // fields come first, and none of them holds a text
+            let message = call.split('"').nth(1).expect("a message");
+            // that of a stop, or about a single job
+            if ["stopped before", "could not", "a job that waits"].iter().any(|other| message.contains(other)) {
+                continue;
+            }
+            warnings += 1;
+            let plain = |text: &str| text.replace('`', "").replace("|  ", "| ").replace("  |", " |");
+            let row = plain(&format!("\n| {message} | "));
+            assert!(plain(&documented).contains(&row), "{path}: {message:?} is not explained");
+        }
+    }
+    assert!(warnings >= 10, "{warnings}");
+}

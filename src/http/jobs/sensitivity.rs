@@ -25,7 +25,7 @@ use std::time::Instant;
     tag = "jobs",
     params(
         ("id" = String, Path, description = "a job of the kind `shrink` that succeeded, of a network, with the output `surface`"),
-        ("Idempotency-Key" = Option<String>, Header, description = "makes the request repeatable for 24 hours"),
+        ("Idempotency-Key" = Option<String>, Header, min_length = 1, max_length = 255, pattern = "^[!-~]+$", description = "makes the request repeatable for 24 hours"),
         ("Prefer" = Option<String>, Header, description = "`wait=N`: wait up to N seconds for the end"),
     ),
     request_body(content = Vec<u8>, content_type = "application/octet-stream", description = "the gradient"),
