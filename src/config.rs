@@ -43,6 +43,8 @@ pub struct Config {
     pub worker: WorkerConfig,
     /// The log.
     pub log: LogConfig,
+    /// Traces.
+    pub traces: TracesConfig,
 }
 
 /// What a node does.
@@ -113,6 +115,16 @@ pub struct LogConfig {
     pub filter: String,
 }
 
+/// Traces, sent by OTLP over HTTP.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TracesConfig {
+    /// Address of the collector, such as `http://127.0.0.1:4318` (`SHRINKD_TRACES__ENDPOINT`); empty sends nothing.
+    pub endpoint: String,
+    /// Share of the traces that is sent, from 0 to 1, of those that no client decided about (`SHRINKD_TRACES__SAMPLE_RATIO`).
+    pub sample_ratio: f64,
+}
+
 /// How a line of the log is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -138,6 +150,7 @@ impl Default for Config {
             limits: Limits { body_bytes: 1 << 20, input_bytes: 256 << 20 },
             worker: WorkerConfig { slots: 2, threads: 0, lease_s: 30, max_losses: 5 },
             log: LogConfig { format: LogFormat::Pretty, filter: "info".to_owned() },
+            traces: TracesConfig { endpoint: String::new(), sample_ratio: 1.0 },
         }
     }
 }
@@ -168,6 +181,7 @@ impl Config {
             (config.worker.slots == 0, "worker.slots must be at least 1"),
             (config.worker.lease_s == 0, "worker.lease_s must be at least 1"),
             (config.worker.max_losses == 0, "worker.max_losses must be at least 1"),
+            (!(0.0..=1.0).contains(&config.traces.sample_ratio), "traces.sample_ratio must be from 0 to 1"),
             (config.retention.every_s == 0, "retention.every_s must be at least 1"),
             (config.retention.inputs_s < 3600, "retention.inputs_s must be at least 3600"),
             (

@@ -7,11 +7,11 @@
 //! old events are kept (a reader that comes too late gets a fresh snapshot).
 
 pub mod conformance;
-mod measured;
 pub mod nats;
+mod observed;
 pub mod sqlite;
 
-pub use measured::Measured;
+pub use observed::Observed;
 
 use crate::job::{Event, EventKind, Failure, Job, JobId, JobKind, JobSpec, Output, ProgressView, State};
 use futures::stream::BoxStream;

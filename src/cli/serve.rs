@@ -9,6 +9,7 @@ use crate::job::collector;
 use crate::job::worker::Worker;
 use crate::telemetry;
 use crate::telemetry::metrics::{self, Exposition};
+use crate::telemetry::traces::Traces;
 use serde::Serialize;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -49,14 +50,21 @@ pub fn run(args: &ServeArgs) -> ExitCode {
         Ok(config) => config,
         Err(error) => return fail(BAD_USAGE, &error),
     };
-    if let Err(error) = telemetry::start(&config.log) {
-        return fail(BAD_USAGE, &error);
-    }
     let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
         Ok(runtime) => runtime,
         Err(error) => return fail(FAILED, &error),
     };
+    let traces = match Traces::start(&config.traces, runtime.handle()) {
+        Ok(traces) => traces,
+        Err(error) => return fail(BAD_USAGE, &error),
+    };
+    if let Err(error) = telemetry::start(&config.log, traces.as_ref()) {
+        return fail(BAD_USAGE, &error);
+    }
     let result = runtime.block_on(serve(config, args.first.clone()));
+    if let Some(traces) = traces {
+        runtime.block_on(traces.stop());
+    }
     // a computation that did not see its token in time must not hold up the end
     runtime.shutdown_background();
     match result {

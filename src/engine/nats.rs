@@ -305,7 +305,7 @@ impl Engine for NatsEngine {
 
     async fn spec(&self, id: JobId) -> Result<Option<JobSpec>, EngineError> {
         let stored = patiently(self.node.ledger.request(id)).await?;
-        let read = |value| JobSpec::from_value(&value).map_err(|faults| EngineError::Store(format!("{faults:?}")));
+        let read = |value| JobSpec::from_stored(value).map_err(|faults| EngineError::Store(format!("{faults:?}")));
         stored.map(read).transpose()
     }
 

@@ -122,7 +122,7 @@ impl Engine for SqliteEngine {
 
     async fn spec(&self, id: JobId) -> Result<Option<JobSpec>, EngineError> {
         let stored = self.read(move |c| records::spec(c, id)).await?;
-        let read = |value| JobSpec::from_value(&value).map_err(|faults| EngineError::Store(format!("{faults:?}")));
+        let read = |value| JobSpec::from_stored(value).map_err(|faults| EngineError::Store(format!("{faults:?}")));
         stored.map(read).transpose()
     }
 
@@ -310,7 +310,7 @@ fn claim(ctx: &mut Ctx<'_>, worker: &str, slots: usize, terms: Terms) -> rusqlit
         let Some((id, attempt, spec)) = taken.optional()? else { break };
         let id: JobId = id.parse().map_err(records::corrupt)?;
         let spec: serde_json::Value = records::from_json(&spec)?;
-        match JobSpec::from_value(&spec) {
+        match JobSpec::from_stored(spec) {
             Ok(spec) => {
                 records::tell_state(ctx, id)?;
                 claims.push(Claim { id, attempt, spec, worker: worker.to_owned(), lease: terms.lease });

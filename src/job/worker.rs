@@ -12,6 +12,7 @@ use crate::engine::{Claim, Engine, EngineError, Outcome, Renewal, Update};
 use crate::job::pipeline::{self, Asked, Kept, StateBytes};
 use crate::settings::{CancelToken, Progress, Settings};
 use crate::telemetry::metrics::{self, Present};
+use crate::telemetry::traces;
 use bytes::Bytes;
 use std::cell::Cell;
 use std::sync::{Arc, Mutex};
@@ -21,6 +22,7 @@ use tokio::time::Interval;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 use tracing::Instrument as _;
+use tracing::field::Empty;
 
 /// Least time between two progress events of a job.
 const PROGRESS_EVERY: Duration = Duration::from_millis(100);
@@ -87,7 +89,12 @@ impl Worker {
             };
             for (claim, permit) in claims.into_iter().zip(permits) {
                 let (worker, give_back) = (worker.clone(), give_back.clone());
-                let span = tracing::info_span!("job", job.id = %claim.id, job.attempt = claim.attempt);
+                let span =
+                    tracing::info_span!("job", job.id = %claim.id, job.attempt = claim.attempt, trace.id = Empty);
+                traces::join(&span, claim.spec.traceparent.as_deref());
+                if let Some(position) = traces::position(&span) {
+                    span.record("trace.id", traces::trace_id(&position));
+                }
                 jobs.spawn(
                     async move {
                         worker.attempt(claim, give_back).await;

@@ -79,7 +79,8 @@ pub async fn differentiate(
     let mut sensing = sensing(&app, &job).await?;
     sensing.gradient = app.blobs.put(bytes).await?;
     let outputs = OutputName::of(JobKind::Sensitivity).to_vec();
-    let spec = JobSpec { work: Work::Sensitivity(Box::new(sensing)), outputs, labels: BTreeMap::new() };
+    let spec =
+        JobSpec { work: Work::Sensitivity(Box::new(sensing)), outputs, labels: BTreeMap::new(), traceparent: None };
     let submitted = app.engine.submit(NewJob { id: JobId::new(), spec, key }).await?;
     drop(promise);
     tell_accepted(&submitted, clock);

@@ -1,4 +1,4 @@
-//! An engine that is timed: every call that answers at once, and how it went. Calls that wait by design ([`Engine::claim`],
+//! An engine that is observed: every call that answers at once is timed, and a job that is submitted remembers the trace of its request. Calls that wait by design ([`Engine::claim`],
 //! [`Engine::interrupted`]) are passed on as they are.
 
 use super::{
@@ -6,13 +6,13 @@ use super::{
     Renewal, Submitted, Update,
 };
 use crate::job::{Job, JobId, JobSpec};
-use crate::telemetry::metrics;
+use crate::telemetry::{metrics, traces};
 use jiff::Timestamp;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Passes everything on to another engine.
-pub struct Measured(pub Arc<dyn Engine>);
+pub struct Observed(pub Arc<dyn Engine>);
 
 async fn timed<T>(call: &'static str, work: impl Future<Output = Result<T, EngineError>>) -> Result<T, EngineError> {
     let clock = Instant::now();
@@ -27,8 +27,9 @@ async fn timed<T>(call: &'static str, work: impl Future<Output = Result<T, Engin
 }
 
 #[async_trait::async_trait]
-impl Engine for Measured {
-    async fn submit(&self, job: NewJob) -> Result<Submitted, EngineError> {
+impl Engine for Observed {
+    async fn submit(&self, mut job: NewJob) -> Result<Submitted, EngineError> {
+        job.spec.traceparent = traces::current();
         timed("submit", self.0.submit(job)).await
     }
     async fn recall(&self, key: IdempotencyKey) -> Result<Option<Submitted>, EngineError> {
