@@ -30,6 +30,23 @@ pub fn endless(label: &str) -> Value {
     })
 }
 
+/// A training that takes longer than any measurement and keeps the memory that it has from its beginning.
+pub fn training(mesh: &str) -> Value {
+    json!({
+        "kind": "fit",
+        "meshes": [mesh],
+        "fit": {"epochs": 10_000, "samples": 20_000},
+        "labels": {"load": "followers"},
+    })
+}
+
+/// Uploads a mesh, a tetrahedron; its name.
+pub async fn upload(http: &Client, url: &str) -> Outcome<String> {
+    const TETRAHEDRON: &str = "OFF\n4 4 6\n1 1 1\n1 -1 -1\n-1 1 -1\n-1 -1 1\n3 0 1 2\n3 0 3 1\n3 0 2 3\n3 1 3 2\n";
+    let input: Value = http.post(format!("{url}/v1/inputs")).body(TETRAHEDRON).send().await?.json().await?;
+    input["id"].as_str().map(str::to_owned).ok_or_else(|| format!("the mesh was not taken: {input}").into())
+}
+
 /// A client that keeps its connection.
 pub fn client() -> Outcome<Client> {
     Ok(Client::builder().timeout(PATIENCE).build()?)

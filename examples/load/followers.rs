@@ -1,7 +1,7 @@
 //! Many open streams on few running jobs.
 
 use crate::Load;
-use crate::client::{cancel, client, endless, follow, percentile, running, small, submit};
+use crate::client::{cancel, client, follow, percentile, running, small, submit, training, upload};
 use crate::service::Outcome;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -26,9 +26,9 @@ pub async fn measure(load: &Load) -> Outcome<()> {
     let folder = tempfile::tempdir()?;
     let node = load.node(folder.path(), &[("SHRINKD_WORKER__SLOTS", load.jobs.to_string())]).await?;
     let (url, http) = (node.url(), client()?);
-    let mut jobs = Vec::new();
+    let (mesh, mut jobs) = (upload(&http, &url).await?, Vec::new());
     for _ in 0..load.jobs {
-        jobs.push(submit(&http, &url, &endless("followers")).await?.0);
+        jobs.push(submit(&http, &url, &training(&mesh)).await?.0);
     }
     for id in &jobs {
         running(&http, &url, id).await?;

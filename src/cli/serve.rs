@@ -5,8 +5,8 @@ use super::{BAD_USAGE, FAILED, ServeArgs, fail, first_job};
 use crate::blobs::Blobs;
 use crate::config::{Config, FOLDER, Role, SQLITE};
 use crate::http::{self, App};
-use crate::job::collector;
 use crate::job::worker::Worker;
+use crate::job::{collector, priority};
 use crate::telemetry;
 use crate::telemetry::metrics::{self, Exposition};
 use crate::telemetry::traces::Traces;
@@ -105,6 +105,7 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(config.worker.threads)
         .thread_name(|i| format!("pool-{i}"))
+        .start_handler(|_| priority::give_way())
         .build()?;
     let stop = CancellationToken::new();
     let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);

@@ -1,10 +1,11 @@
 //! The worker: claims jobs, runs them on the rayon pool, tells their news, and ends them.
 //!
-//! Computing happens on blocking threads and on the pool, never on the async runtime. A worker takes exactly as many jobs as
+//! Computing happens on threads of its own and on the pool, never on the async runtime, and [gives way](priority) to it. A worker takes exactly as many jobs as
 //! it has free slots, renews each claim every third of its lease, and stops a computation within a heartbeat of losing it.
 
 use super::failure::{Ended, Failure};
 use super::preview::MeshPreview;
+use super::priority;
 use super::spec::{FieldSpec, Work};
 use super::{EventKind, JobId, Output, OutputName, ProgressView};
 use crate::blobs::{BlobError, BlobId, Blobs};
@@ -296,8 +297,8 @@ impl Worker {
                     }
                 }
             };
-            let made = tokio::task::spawn_blocking(compute).await.unwrap_or_else(|panic| {
-                tracing::error!(%panic, "the computation panicked");
+            let made = priority::compute(compute).await.unwrap_or_else(|| {
+                tracing::error!("the computation panicked");
                 Err(Failure::internal().into())
             });
             made.map_err(Unfinished::Ended)

@@ -21,6 +21,7 @@ mod relaxed;
 #[path = "../support/bucket.rs"]
 mod s3;
 mod sensitivity;
+mod traces;
 mod walk;
 mod warm;
 mod weight;
