@@ -3,8 +3,8 @@
 //! Where all cores compute, a thread that answers a request would wait for its turn behind them. So whoever computes says that it is
 //! not in a hurry: the cores are still all its own while nothing else is to be done.
 
-/// How far computing stands back, on the scale of nice(2) from 0 to 19: at 10 a thread that answers weighs ten times as much.
-const NICENESS: i32 = 10;
+/// How far computing stands back, on the scale of nice(2) from 0 to 19: at 5 a thread that answers weighs three times as much.
+const NICENESS: i32 = 5;
 
 /// Makes the calling thread give way, for good: only a privileged process could take it back.
 pub fn give_way() {
