@@ -6,8 +6,9 @@ mod scene;
 use super::problem::ProblemDocument;
 use axum::Json;
 use utoipa::openapi::content::ContentBuilder;
-use utoipa::openapi::path::Operation;
-use utoipa::openapi::{OpenApi, Ref, RefOr, Response};
+use utoipa::openapi::path::{Operation, Parameter};
+use utoipa::openapi::schema::{Array, Object, SchemaType, Type};
+use utoipa::openapi::{OpenApi, Ref, RefOr, Response, Schema};
 use utoipa::{OpenApi as _, ToSchema as _};
 
 /// The media type of every answer that is not a success.
@@ -31,6 +32,7 @@ const PROBLEM: &str = "application/problem+json";
         crate::job::event::EventKind,
         crate::job::preview::MeshPreview,
         crate::job::ProgressView,
+        super::list::LabelFilter,
     )),
 )]
 struct Base;
@@ -47,6 +49,7 @@ pub(super) fn complete(mut document: OpenApi) -> OpenApi {
             [&mut item.get, &mut item.head, &mut item.post, &mut item.delete, &mut item.put, &mut item.patch];
         for operation in operations.into_iter().flatten() {
             describe_problems(operation);
+            operation.parameters.iter_mut().flatten().for_each(never_null);
         }
         // the router answers HEAD from GET; both are one operation, which needs an own name in each method
         if let Some(head) = &mut item.head {
@@ -56,6 +59,20 @@ pub(super) fn complete(mut document: OpenApi) -> OpenApi {
     links::add(&mut document);
     scene::add(&mut document);
     document
+}
+
+/// A parameter that is optional is left out; there is no null that could be sent.
+fn never_null(parameter: &mut RefOr<Parameter>) {
+    let RefOr::T(parameter) = parameter else { return };
+    if let Some(RefOr::T(Schema::Object(Object { schema_type, .. }) | Schema::Array(Array { schema_type, .. }))) =
+        &mut parameter.schema
+        && let SchemaType::Array(types) = schema_type
+    {
+        types.retain(|kind| *kind != Type::Null);
+        if let [one] = types.as_slice() {
+            *schema_type = SchemaType::Type(one.clone());
+        }
+    }
 }
 
 fn describe_problems(operation: &mut Operation) {
