@@ -52,6 +52,6 @@ canceler=$!
 
 cd "$work"
 "$tool/bin/st" --config-file "$here/schemathesis.toml" run "$url/openapi.json" \
-  --phases examples,coverage,fuzzing,stateful --checks all --mode all --seed 1 --max-examples "${SHRINKD_EXAMPLES:-40}" \
+  --phases examples,coverage,fuzzing,stateful --checks all --mode all --seed 1 --max-examples "${SCHEMATHESIS_EXAMPLES:-40}" \
   --generation-deterministic --continue-on-failure --request-timeout 90 --no-color
 "$program" healthcheck "$url"
