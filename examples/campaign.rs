@@ -9,24 +9,24 @@
 //! Clients submit small jobs under keys and repeat a submit until it is answered. Meanwhile nodes are killed and frozen, with `nats` the
 //! server, too, and now and then everything at once. At the end all is started again, every accepted job must come to its end, and what
 //! it made is downloaded and compared with the hash that its record promises. Exits 1 when a job was lost, ended twice or left
-//! half an output. `--program` names the service ([`PROGRAM`] by default); the NATS server is found as the tests find it.
+//! half an output. `--program` names the service ([`service::PROGRAM`] by default); the NATS server is found as the tests find it.
 
 #[path = "../tests/support/nats_server.rs"]
 mod nats_server;
+#[path = "../tests/support/service.rs"]
+mod service;
 
 use nats_server::NatsServer;
 use reqwest::{Client, StatusCode};
 use serde_json::{Value, json};
+use service::{Node, Outcome, option};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
-use std::net::TcpListener;
-use std::path::PathBuf;
-use std::process::{Child, Command, ExitCode, Stdio};
+use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-const PROGRAM: &str = "target/release/shrinkd";
 /// Nodes of the cluster; the embedded engine is for one.
 const NODES: usize = 3;
 const CLIENTS: usize = 6;
@@ -34,8 +34,6 @@ const CLIENTS: usize = 6;
 const LEASE: Duration = Duration::from_secs(3);
 /// Time for what was accepted to come to its end once the faults are over.
 const PATIENCE: Duration = Duration::from_secs(300);
-
-type Outcome<T> = Result<T, Box<dyn std::error::Error + Send + Sync>>;
 
 /// Numbers that only depend on the seed (Steele et al. 2014, splitmix64).
 struct Random(u64);
@@ -51,62 +49,6 @@ impl Random {
 
     fn millis(&mut self, from: u64, to: u64) -> Duration {
         Duration::from_millis(from + self.below(to - from))
-    }
-}
-
-/// A process of the service, on a port that stays its own.
-struct Node {
-    child: Child,
-    port: u16,
-    program: PathBuf,
-    folder: PathBuf,
-    engine: String,
-}
-
-impl Node {
-    fn start(program: PathBuf, folder: PathBuf, engine: String) -> Outcome<Self> {
-        let port = TcpListener::bind("127.0.0.1:0")?.local_addr()?.port();
-        let child = Self::spawn(&program, &folder, &engine, port)?;
-        Ok(Self { child, port, program, folder, engine })
-    }
-
-    fn spawn(program: &PathBuf, folder: &PathBuf, engine: &str, port: u16) -> Outcome<Child> {
-        let mut command = Command::new(program);
-        command.args(["serve", "--listen", &format!("127.0.0.1:{port}"), "--engine", engine, "--data"]).arg(folder);
-        command.env("SHRINKD_WORKER__LEASE_S", LEASE.as_secs().to_string());
-        // a job that is lost again and again is what this is about
-        command.env("SHRINKD_WORKER__MAX_LOSSES", "1000000").env("SHRINKD_LOG__FILTER", "error");
-        Ok(command.stdout(Stdio::null()).stderr(Stdio::null()).spawn()?)
-    }
-
-    fn url(&self) -> String {
-        format!("http://127.0.0.1:{}", self.port)
-    }
-
-    fn kill(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-
-    fn restart(&mut self) -> Outcome<()> {
-        self.kill();
-        self.child = Self::spawn(&self.program, &self.folder, &self.engine, self.port)?;
-        Ok(())
-    }
-
-    /// Starts it again if it has ended by itself, as a service manager would.
-    fn revive(&mut self) -> Outcome<()> {
-        if self.child.try_wait()?.is_some() { self.restart() } else { Ok(()) }
-    }
-
-    fn signal(&self, name: &str) {
-        let _ = Command::new("kill").args([name, &self.child.id().to_string()]).status();
-    }
-}
-
-impl Drop for Node {
-    fn drop(&mut self) {
-        self.kill();
     }
 }
 
@@ -303,13 +245,9 @@ async fn judge(http: &Client, url: &str, id: &str, deadline: Instant, counts: &m
     Ok(())
 }
 
-fn option(name: &str) -> Option<String> {
-    std::env::args().skip_while(|argument| argument != name).nth(1)
-}
-
 #[tokio::main]
 async fn main() -> Outcome<ExitCode> {
-    let program = PathBuf::from(option("--program").unwrap_or_else(|| PROGRAM.to_owned()));
+    let program = service::program();
     let seconds: u64 = option("--seconds").unwrap_or_else(|| "60".to_owned()).parse()?;
     let mut random = Random(option("--seed").unwrap_or_else(|| "1".to_owned()).parse()?);
     let folder = tempfile::tempdir()?;
@@ -322,7 +260,13 @@ async fn main() -> Outcome<ExitCode> {
         None | Some("sqlite") => (None, "sqlite".to_owned(), 1),
         Some(other) => return Err(format!("--engine is sqlite or nats, and not {other}").into()),
     };
-    let nodes = (0..count).map(|_| Node::start(program.clone(), folder.path().to_owned(), engine.clone()));
+    let variables = [
+        ("SHRINKD_ENGINE", engine),
+        ("SHRINKD_WORKER__LEASE_S", LEASE.as_secs().to_string()),
+        // a job that is lost again and again is what this is about
+        ("SHRINKD_WORKER__MAX_LOSSES", "1000000".to_owned()),
+    ];
+    let nodes = (0..count).map(|_| Node::start(&program, folder.path(), &variables));
     let mut nodes = nodes.collect::<Outcome<Vec<_>>>()?;
     let urls: Vec<String> = nodes.iter().map(Node::url).collect();
     let (ledger, over) = (Arc::new(Mutex::new(Ledger::default())), Arc::new(AtomicBool::new(false)));

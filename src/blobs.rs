@@ -6,6 +6,7 @@
 //! the hash, ranges do not.
 
 mod id;
+mod measured;
 mod place;
 
 pub use id::{BlobId, InvalidBlobId};

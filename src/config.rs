@@ -17,6 +17,10 @@ use std::path::{Path, PathBuf};
 pub struct Config {
     /// Address to listen on (`SHRINKD_LISTEN`). Beyond loopback only with authentication, or where `auth.open_beyond_loopback` allows it.
     pub listen: SocketAddr,
+    /// Address to serve `/metrics` at, and nothing else (`SHRINKD_METRICS_LISTEN`); empty serves it at `listen`. Nobody is asked for a
+    /// key there.
+    #[serde(with = "unless_empty")]
+    pub metrics_listen: Option<SocketAddr>,
     /// Folder of the database and the blobs (`SHRINKD_DATA_DIR`), made when it is not there.
     pub data_dir: PathBuf,
     /// Where jobs are kept (`SHRINKD_ENGINE`): `sqlite`, in the folder and for one process; or the
@@ -41,6 +45,8 @@ pub struct Config {
     pub worker: WorkerConfig,
     /// The log.
     pub log: LogConfig,
+    /// Traces.
+    pub traces: TracesConfig,
 }
 
 /// What a node does.
@@ -172,6 +178,16 @@ pub struct LogConfig {
     pub filter: String,
 }
 
+/// Traces, sent by OTLP over HTTP.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TracesConfig {
+    /// Address of the collector, such as `http://127.0.0.1:4318` (`SHRINKD_TRACES__ENDPOINT`); empty sends nothing.
+    pub endpoint: String,
+    /// Share of the traces that is sent, from 0 to 1, of those that no client decided about (`SHRINKD_TRACES__SAMPLE_RATIO`).
+    pub sample_ratio: f64,
+}
+
 /// How a line of the log is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -186,6 +202,7 @@ impl Default for Config {
     fn default() -> Self {
         Self {
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
+            metrics_listen: None,
             data_dir: PathBuf::from("./shrinkd-data"),
             engine: SQLITE.to_owned(),
             cors_origins: Vec::new(),
@@ -197,6 +214,7 @@ impl Default for Config {
             limits: Limits { body_bytes: 1 << 20, input_bytes: 256 << 20 },
             worker: WorkerConfig { slots: 2, threads: 0, lease_s: 30, max_losses: 5 },
             log: LogConfig { format: LogFormat::Pretty, filter: "info".to_owned() },
+            traces: TracesConfig { endpoint: String::new(), sample_ratio: 1.0 },
         }
     }
 }
@@ -227,6 +245,7 @@ impl Config {
             (config.worker.slots == 0, "worker.slots must be at least 1"),
             (config.worker.lease_s == 0, "worker.lease_s must be at least 1"),
             (config.worker.max_losses == 0, "worker.max_losses must be at least 1"),
+            (!(0.0..=1.0).contains(&config.traces.sample_ratio), "traces.sample_ratio must be from 0 to 1"),
             (config.retention.every_s == 0, "retention.every_s must be at least 1"),
             (config.retention.inputs_s < 3600, "retention.inputs_s must be at least 3600"),
             (
@@ -255,6 +274,27 @@ impl Config {
             && self.auth.mode == AuthMode::None
             && !self.auth.open_beyond_loopback
             && !self.listen.ip().is_loopback()
+    }
+}
+
+/// A value that may be left out: TOML and the environment say so with an empty text.
+mod unless_empty {
+    use serde::{Deserialize, Deserializer, Serializer, de::Error};
+    use std::fmt::Display;
+    use std::str::FromStr;
+
+    pub fn serialize<T: Display, S: Serializer>(value: &Option<T>, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(&value.as_ref().map(ToString::to_string).unwrap_or_default())
+    }
+
+    pub fn deserialize<'de, T, D>(deserializer: D) -> Result<Option<T>, D::Error>
+    where
+        T: FromStr<Err: Display>,
+        D: Deserializer<'de>,
+    {
+        let text = String::deserialize(deserializer)?;
+        let parsed = (!text.is_empty()).then(|| text.parse()).transpose();
+        parsed.map_err(|error| D::Error::custom(format!("{text:?}: {error}")))
     }
 }
 

@@ -10,9 +10,12 @@
 
 pub mod conformance;
 pub mod nats;
+mod observed;
 pub mod sqlite;
 
-use crate::job::{Event, EventKind, Failure, Job, JobId, JobSpec, Output, ProgressView, State};
+pub use observed::Observed;
+
+use crate::job::{Event, EventKind, Failure, Job, JobId, JobKind, JobSpec, Output, ProgressView, State};
 use crate::tenant::Tenant;
 use futures::stream::BoxStream;
 use jiff::Timestamp;
@@ -180,6 +183,19 @@ impl Outcome {
     }
 }
 
+/// How much there is to do.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Depth {
+    /// How many jobs there are of a kind in a state; only of those that have not ended, and only where there are any.
+    pub open: Vec<(JobKind, State, u64)>,
+    /// When the oldest job that is queued was accepted.
+    pub oldest_queued: Option<Timestamp>,
+    /// Whether the engine is connected to where the jobs are kept.
+    pub connected: bool,
+    /// Changes of other nodes that this one has not read yet.
+    pub lag: u64,
+}
+
 /// What an engine can fail with. The text is for the log, not for clients.
 #[derive(Debug, thiserror::Error)]
 pub enum EngineError {
@@ -249,6 +265,8 @@ pub trait Engine: Send + Sync {
     ) -> Result<Option<EventPage>, EngineError>;
     /// The job's events from now on. Every change of a record is told by an event.
     fn changes(&self, tenant: &Tenant, id: JobId) -> Changes;
+    /// How much there is to do, as this node sees it.
+    async fn depth(&self) -> Result<Depth, EngineError>;
     /// Whether the engine can do its work.
     async fn health(&self) -> Result<(), EngineError>;
 }

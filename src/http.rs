@@ -13,6 +13,7 @@ pub mod health;
 pub mod inputs;
 pub mod jobs;
 pub mod list;
+pub mod metrics;
 pub mod openapi;
 pub mod outputs;
 pub mod page;
@@ -25,6 +26,7 @@ use crate::auth::Authenticator;
 use crate::blobs::Blobs;
 use crate::config::{Limits, Retention};
 use crate::engine::Engine;
+use crate::telemetry::metrics::Exposition;
 use axum::http::HeaderValue;
 use axum::middleware;
 use std::sync::Arc;
@@ -48,6 +50,10 @@ pub struct App {
     pub retention: Retention,
     /// How long a link into the bucket is good for that a download is answered with; zero sends the bytes.
     pub download_link: Duration,
+    /// What is counted and measured.
+    pub metrics: Exposition,
+    /// Whether that is served at an address of its own.
+    pub metrics_apart: bool,
     /// Raised when the service stops.
     pub stop: CancellationToken,
 }
@@ -69,6 +75,7 @@ fn api() -> OpenApiRouter<App> {
         .routes(routes!(health::livez))
         .routes(routes!(health::readyz))
         .routes(routes!(openapi::openapi_json))
+        .routes(routes!(metrics::metrics))
         // for a person
         .routes(routes!(page::page))
 }
@@ -78,14 +85,17 @@ pub fn document() -> utoipa::openapi::OpenApi {
     openapi::complete(api().into_openapi())
 }
 
-/// What a node that only runs jobs answers: whether it lives and is ready.
+/// What a node that only runs jobs answers: whether it lives and is ready, and what is measured.
 pub fn health_router(app: App) -> axum::Router {
     let (router, _) = OpenApiRouter::<App>::default()
         .routes(routes!(health::livez))
         .routes(routes!(health::readyz))
+        .routes(routes!(metrics::metrics))
         .split_for_parts();
     let router = router.fallback(problem::unknown_route).method_not_allowed_fallback(problem::wrong_method);
-    router.with_state(app).layer(middleware::from_fn(context::request))
+    // it has nothing of any tenant
+    let router = router.with_state(app).layer(middleware::from_fn_with_state(None, caller::identify));
+    router.layer(middleware::from_fn(context::request))
 }
 
 /// The service, for those whom the authenticator knows, or for everybody where there is none. Browsers of other origins are let in only when `cors_origins` names them.

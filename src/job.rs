@@ -9,6 +9,7 @@ pub mod event;
 pub mod failure;
 pub mod pipeline;
 pub mod preview;
+pub mod priority;
 pub mod spec;
 pub mod worker;
 

@@ -1,5 +1,6 @@
 //! Where blobs lie: a folder of this machine, or a bucket that every node reaches.
 
+use super::measured::Measured;
 use object_store::aws::{AmazonS3, AmazonS3Builder};
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
@@ -46,7 +47,8 @@ impl Place {
     /// A folder, which is made when it is not there.
     pub fn folder(folder: &std::path::Path) -> Result<Self, PlaceError> {
         std::fs::create_dir_all(folder).map_err(|source| PlaceError::Folder { path: folder.to_owned(), source })?;
-        Ok(Self { store: Arc::new(LocalFileSystem::new_with_prefix(folder)?.with_fsync(true)), bucket: None })
+        let store = LocalFileSystem::new_with_prefix(folder)?.with_fsync(true);
+        Ok(Self { store: Arc::new(Measured(Arc::new(store))), bucket: None })
     }
 
     /// `s3://BUCKET/PREFIX`.
@@ -63,7 +65,8 @@ impl Place {
             .with_retry(retry)
             .build()?;
         let (s3, prefix) = (Arc::new(s3), Path::from(prefix));
-        Ok(Self { store: Arc::new(PrefixStore::new(s3.clone(), prefix.clone())), bucket: Some((s3, prefix)) })
+        let store = PrefixStore::new(s3.clone(), prefix.clone());
+        Ok(Self { store: Arc::new(Measured(Arc::new(store))), bucket: Some((s3, prefix)) })
     }
 
     /// The store.

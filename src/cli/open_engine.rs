@@ -4,7 +4,7 @@ use crate::auth::keys::{KeyFile, KeyStore};
 use crate::config::{Config, SQLITE};
 use crate::engine::nats::{Address, NatsEngine, NatsKeys};
 use crate::engine::sqlite::SqliteEngine;
-use crate::engine::{Engine, Terms};
+use crate::engine::{Engine, Observed, Terms};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::time::Instant;
@@ -19,7 +19,7 @@ const PAUSE: Duration = Duration::from_millis(500);
 pub async fn open_engine(config: &Config) -> Result<Arc<dyn Engine>, Box<dyn std::error::Error>> {
     let terms = Terms { lease: Duration::from_secs(config.worker.lease_s), max_losses: config.worker.max_losses };
     if config.engine == SQLITE {
-        return Ok(Arc::new(SqliteEngine::open(&config.data_dir, terms)?));
+        return Ok(Arc::new(Observed(Arc::new(SqliteEngine::open(&config.data_dir, terms)?))));
     }
     let address: Address = config.engine.parse()?;
     let (folder, patience) = (config.data_dir.join("projection"), Instant::now() + READY);
@@ -27,7 +27,7 @@ pub async fn open_engine(config: &Config) -> Result<Arc<dyn Engine>, Box<dyn std
         match NatsEngine::open(&address, &folder, terms).await {
             Ok(engine) => {
                 tracing::info!(nats.servers = %address, "joined the cluster");
-                return Ok(Arc::new(engine));
+                return Ok(Arc::new(Observed(Arc::new(engine))));
             }
             Err(error) if Instant::now() >= patience => return Err(error.into()),
             Err(error) => tracing::warn!(%error, "the cluster is not ready yet"),

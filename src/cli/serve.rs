@@ -8,9 +8,11 @@ use crate::auth::keys::KeyRing;
 use crate::blobs::Blobs;
 use crate::config::{AuthMode, Config, FOLDER, Role, SQLITE};
 use crate::http::{self, App};
-use crate::job::collector;
 use crate::job::worker::Worker;
+use crate::job::{collector, priority};
 use crate::telemetry;
+use crate::telemetry::metrics::{self, Exposition};
+use crate::telemetry::traces::Traces;
 use serde::Serialize;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -56,14 +58,21 @@ pub fn run(args: &ServeArgs) -> ExitCode {
                    keeps strangers away";
         return fail(BAD_USAGE, &why);
     }
-    if let Err(error) = telemetry::start(&config.log) {
-        return fail(BAD_USAGE, &error);
-    }
     let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
         Ok(runtime) => runtime,
         Err(error) => return fail(FAILED, &error),
     };
+    let traces = match Traces::start(&config.traces, runtime.handle()) {
+        Ok(traces) => traces,
+        Err(error) => return fail(BAD_USAGE, &error),
+    };
+    if let Err(error) = telemetry::start(&config.log, traces.as_ref()) {
+        return fail(BAD_USAGE, &error);
+    }
     let result = runtime.block_on(serve(config, args.first.clone()));
+    if let Some(traces) = traces {
+        runtime.block_on(traces.stop());
+    }
     // a computation that did not see its token in time must not hold up the end
     runtime.shutdown_background();
     match result {
@@ -113,11 +122,13 @@ async fn open_authenticator(
 }
 
 async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std::error::Error>> {
+    let exposition = Exposition::start()?;
     let engine = open_engine(&config).await?;
     let blobs = open_blobs(&config).await?;
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(config.worker.threads)
         .thread_name(|i| format!("pool-{i}"))
+        .start_handler(|_| priority::give_way())
         .build()?;
     let stop = CancellationToken::new();
     let authenticator = open_authenticator(&config, &stop).await?;
@@ -127,6 +138,9 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
     let address = listener.local_addr()?;
     if !address.ip().is_loopback() && config.auth.mode == AuthMode::None && config.role != Role::Worker {
         tracing::warn!("listening beyond loopback without authentication: whoever reaches this address can use it");
+    }
+    if config.role != Role::Api {
+        metrics::worker_started(config.worker.slots, pool.current_num_threads());
     }
     let (engine_of_worker, blobs_of_worker) = (engine.clone(), blobs.clone());
     let worker = move || Worker {
@@ -144,8 +158,15 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
         limits: config.limits.clone(),
         retention: config.retention,
         download_link: Duration::from_secs(config.download_link_s),
+        metrics: exposition,
+        metrics_apart: config.metrics_listen.is_some(),
         stop: stop.clone(),
     };
+    if let Some(address) = config.metrics_listen {
+        let (listener, router) = (TcpListener::bind(address).await?, http::metrics::router(app.clone()));
+        tracing::info!(http.address = %listener.local_addr()?, "serving metrics");
+        tokio::spawn(axum::serve(listener, router).into_future());
+    }
     let router = match config.role {
         Role::Worker => http::health_router(app),
         Role::All | Role::Api => http::router(app, authenticator, &config.cors_origins),

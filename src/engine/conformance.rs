@@ -8,12 +8,12 @@
 //! ```
 
 use super::{
-    Claim, Engine, EngineError, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Renewal, Submitted, Update,
-    follow,
+    Claim, Depth, Engine, EngineError, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Renewal, Submitted,
+    Update, follow,
 };
 use crate::blobs::BlobId;
 use crate::job::spec::{WarmStartSpec, Work};
-use crate::job::{Event, EventKind, Failure, JobId, JobSpec, Output, ProgressView, State};
+use crate::job::{Event, EventKind, Failure, JobId, JobKind, JobSpec, Output, ProgressView, State};
 use crate::tenant::Tenant;
 use futures::StreamExt;
 use jiff::Timestamp;
@@ -65,6 +65,7 @@ pub async fn run(engine: Arc<dyn Engine>) {
     a_blob_is_named_while_a_job_remembers_it(&engine).await;
     another_tenants_job_is_not_there(&engine).await;
     keys_and_labels_are_each_tenants_own(&engine).await;
+    what_there_is_to_do_is_counted(&engine).await;
     engine.health().await.expect("healthy");
 }
 
@@ -478,4 +479,30 @@ async fn keys_and_labels_are_each_tenants_own(engine: &Arc<dyn Engine>) {
         assert_eq!(page.jobs.iter().map(|job| job.id).collect::<Vec<_>>(), [jobs[i].id]);
         engine.request_cancel(owner, jobs[i].id).await.expect("cancels");
     }
+}
+
+/// Other claims may have left jobs behind: what counts is the difference.
+async fn what_there_is_to_do_is_counted(engine: &Arc<dyn Engine>) {
+    let count = |depth: &Depth, state| {
+        depth.open.iter().filter(|open| (open.0, open.1) == (JobKind::Shrink, state)).map(|open| open.2).sum::<u64>()
+    };
+    // whatever waits is taken away, so that the claim below is of this job
+    for claim in engine.claim("a", 100, Duration::ZERO).await.expect("claims") {
+        engine.finish(&claim, Outcome::Canceled).await.expect("finishes");
+    }
+    let before = engine.depth().await.expect("counts");
+    assert_eq!((count(&before, State::Queued), before.oldest_queued), (0, None));
+    let (first, second) = (submit(engine, new_job()).await, submit(engine, new_job()).await);
+    let accepted = engine.get(&Tenant::default(), first).await.expect("reads").expect("is there").created_at;
+    let queued = engine.depth().await.expect("counts");
+    assert_eq!((count(&queued, State::Queued), queued.oldest_queued), (2, Some(accepted)));
+    let claim = claim_one(engine, "a").await;
+    assert_eq!(claim.id, first);
+    let running = engine.depth().await.expect("counts");
+    assert_eq!(count(&running, State::Queued), 1);
+    assert_eq!(count(&running, State::Running), count(&before, State::Running) + 1);
+    engine.finish(&claim, Outcome::Canceled).await.expect("finishes");
+    engine.request_cancel(&Tenant::default(), second).await.expect("cancels");
+    let after = engine.depth().await.expect("counts");
+    assert_eq!((&after.open, after.oldest_queued, after.connected), (&before.open, None, true));
 }

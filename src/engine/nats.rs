@@ -38,7 +38,7 @@ pub use address::{Address, InvalidAddress, SCHEMES};
 pub use api_keys::NatsKeys;
 
 use super::{
-    Changes, Claim, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Page,
+    Changes, Claim, Depth, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Page,
     Renewal, Submitted, Terms, Update,
 };
 use crate::job::{Job, JobId, JobSpec, State};
@@ -258,6 +258,14 @@ impl Node {
         Ok(projection.events_after(name, after, limit).await?.map(|(page, _)| page))
     }
 
+    /// The servers are asked for the number of the newest entry only; the counts are this node's own.
+    async fn depth(&self) -> Result<Depth, EngineError> {
+        let newest = tokio::time::timeout(HEALTH, self.ledger.layout.jobs.get_info()).await.ok().and_then(Result::ok);
+        let (open, oldest_queued) = self.ledger.projection.depth().await?;
+        let lag = newest.as_ref().map_or(0, |info| info.state.last_sequence.saturating_sub(self.feed.position()));
+        Ok(Depth { open, oldest_queued, connected: newest.is_some(), lag })
+    }
+
     async fn health(&self) -> Result<(), EngineError> {
         if !self.ledger.link.is_up() {
             return Err(EngineError::Store("there is no connection to the cluster".to_owned()));
@@ -312,7 +320,7 @@ impl Engine for NatsEngine {
 
     async fn spec(&self, tenant: &Tenant, id: JobId) -> Result<Option<JobSpec>, EngineError> {
         let stored = patiently(self.node.ledger.request(&Name::new(tenant, id))).await?;
-        let read = |value| JobSpec::from_value(&value).map_err(|faults| EngineError::Store(format!("{faults:?}")));
+        let read = |value| JobSpec::from_stored(value).map_err(|faults| EngineError::Store(format!("{faults:?}")));
         stored.map(read).transpose()
     }
 
@@ -374,6 +382,10 @@ impl Engine for NatsEngine {
 
     fn changes(&self, tenant: &Tenant, id: JobId) -> Changes {
         Changes(self.node.ledger.projection.subscribe(tenant, id))
+    }
+
+    async fn depth(&self) -> Result<Depth, EngineError> {
+        patiently(self.node.depth()).await
     }
 
     async fn health(&self) -> Result<(), EngineError> {

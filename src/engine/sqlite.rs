@@ -12,10 +12,11 @@ pub(super) mod writer;
 pub(super) use readers::Readers;
 
 use super::{
-    Changes, Claim, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Page,
+    Changes, Claim, Depth, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Page,
     Renewal, Submitted, Terms, Update,
 };
 use crate::job::{Failure, Job, JobId, JobSpec, State};
+use crate::telemetry::metrics;
 use crate::tenant::Tenant;
 use jiff::Timestamp;
 use records::{Change, Ctx};
@@ -62,6 +63,7 @@ impl SqliteEngine {
         let hub = Arc::new(Hub::default());
         let lost = writer::once(&mut connection, &hub, |ctx| records::requeue_lost(ctx, i64::MAX, terms.max_losses))?;
         if lost > 0 {
+            metrics::attempts_lost(lost as u64);
             tracing::warn!(jobs = lost, "jobs of an earlier process are taken up again");
         }
         let writer = Writer::start(connection, hub.clone())?;
@@ -124,7 +126,7 @@ impl Engine for SqliteEngine {
     async fn spec(&self, tenant: &Tenant, id: JobId) -> Result<Option<JobSpec>, EngineError> {
         let tenant = tenant.clone();
         let stored = self.read(move |c| records::spec(c, &tenant, id)).await?;
-        let read = |value| JobSpec::from_value(&value).map_err(|faults| EngineError::Store(format!("{faults:?}")));
+        let read = |value| JobSpec::from_stored(value).map_err(|faults| EngineError::Store(format!("{faults:?}")));
         stored.map(read).transpose()
     }
 
@@ -271,6 +273,11 @@ impl Engine for SqliteEngine {
         Changes(self.hub.subscribe(tenant, id))
     }
 
+    async fn depth(&self) -> Result<Depth, EngineError> {
+        let (open, oldest_queued) = self.read(records::depth).await?;
+        Ok(Depth { open, oldest_queued, connected: true, lag: 0 })
+    }
+
     async fn health(&self) -> Result<(), EngineError> {
         self.write(|ctx| ctx.connection.query_row("SELECT 1", [], |_| Ok(()))).await
     }
@@ -309,7 +316,8 @@ fn submit(ctx: &mut Ctx<'_>, new: &NewJob) -> rusqlite::Result<Submitted> {
 }
 
 fn claim(ctx: &mut Ctx<'_>, worker: &str, slots: usize, terms: Terms) -> rusqlite::Result<Vec<Claim>> {
-    records::requeue_lost(ctx, ctx.now, terms.max_losses)?;
+    let lost = records::requeue_lost(ctx, ctx.now, terms.max_losses)?;
+    metrics::attempts_lost(lost as u64);
     let mut claims = Vec::new();
     while claims.len() < slots {
         let until = ctx.now.saturating_add(terms.lease.as_millis() as i64);
@@ -324,7 +332,7 @@ fn claim(ctx: &mut Ctx<'_>, worker: &str, slots: usize, terms: Terms) -> rusqlit
         let id: JobId = id.parse().map_err(records::corrupt)?;
         let tenant: Tenant = tenant.parse().map_err(records::corrupt)?;
         let spec: serde_json::Value = records::from_json(&spec)?;
-        match JobSpec::from_value(&spec) {
+        match JobSpec::from_stored(spec) {
             Ok(spec) => {
                 records::tell_state(ctx, id)?;
                 claims.push(Claim { tenant, id, attempt, spec, worker: worker.to_owned(), lease: terms.lease });

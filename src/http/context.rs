@@ -1,12 +1,14 @@
 //! What every request gets: an id, a span, one line in the log, and a problem document when it fails.
 
 use super::problem::{self, Problem};
+use crate::telemetry::{metrics, traces};
 use axum::extract::{MatchedPath, Request};
 use axum::http::{HeaderName, HeaderValue};
 use axum::middleware::Next;
 use axum::response::Response;
 use std::time::Instant;
 use tracing::Instrument as _;
+use tracing::field::Empty;
 
 /// The header that carries a request's id, in both directions.
 pub const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
@@ -17,8 +19,13 @@ const MAX_REQUEST_ID: usize = 128;
 pub async fn request(mut request: Request, next: Next) -> Response {
     let id = request_id(&request);
     let route = request.extensions().get::<MatchedPath>().map_or("", |path| path.as_str()).to_owned();
-    let span = tracing::info_span!("request", request.id = %id, http.method = %request.method(), http.path = request.uri().path());
-    let clock = Instant::now();
+    let span = tracing::info_span!("request", request.id = %id, http.method = %request.method(), http.path = request.uri().path(), http.route = route, trace.id = Empty);
+    traces::join(&span, request.headers().get(traces::TRACEPARENT).and_then(|value| value.to_str().ok()));
+    let position = traces::position(&span);
+    if let Some(position) = &position {
+        span.record("trace.id", traces::trace_id(position));
+    }
+    let (clock, method) = (Instant::now(), request.method().clone());
     let id_header = HeaderValue::from_str(&id).unwrap_or_else(|_| HeaderValue::from_static("invalid"));
     request.headers_mut().insert(REQUEST_ID, id_header.clone());
     async move {
@@ -34,8 +41,13 @@ pub async fn request(mut request: Request, next: Next) -> Response {
             response
         };
         response.headers_mut().insert(REQUEST_ID, id_header);
-        let elapsed_ms = clock.elapsed().as_secs_f64() * 1e3;
-        tracing::info!(http.status = status.as_u16(), http.route = route, elapsed_ms, "request answered");
+        if let Some(position) = position.and_then(|position| HeaderValue::from_str(&position).ok()) {
+            response.headers_mut().insert(traces::TRACERESPONSE, position);
+        }
+        let elapsed = clock.elapsed();
+        metrics::request_answered(&method, &route, status.as_u16(), elapsed);
+        let elapsed_ms = elapsed.as_secs_f64() * 1e3;
+        tracing::info!(http.status = status.as_u16(), elapsed_ms, "request answered");
         response
     }
     .instrument(span)

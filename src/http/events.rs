@@ -5,6 +5,7 @@ use super::{App, Problem, query};
 use crate::auth::{Caller, Scope};
 use crate::engine;
 use crate::job::{Event, JobId};
+use crate::telemetry::metrics::{self, Present};
 use crate::tenant::Tenant;
 use axum::Json;
 use axum::extract::{Path, RawQuery, State};
@@ -50,8 +51,8 @@ pub struct EventsPage {
     params(
         ("id" = String, Path, description = "the job"),
         ("after" = Option<u64>, Query, description = "only events after this number"),
-        ("limit" = Option<u64>, Query, description = "events of a JSON page, 1 to 512"),
-        ("Last-Event-ID" = Option<String>, Header, description = "the last number that was seen; goes before `after`"),
+        ("limit" = Option<u64>, Query, minimum = 1, maximum = 512, description = "events of a JSON page, 1 to 512"),
+        ("Last-Event-ID" = Option<String>, Header, pattern = "^[0-9]{0,19}$", description = "the last number that was seen; goes before `after`"),
     ),
     responses(
         (status = 200, description = "the events", content((String = "text/event-stream"), (EventsPage = "application/json"))),
@@ -100,8 +101,11 @@ async fn stream(app: App, tenant: &Tenant, id: JobId, after: Option<u64>) -> Res
         }
     }
     let events = engine::follow(app.engine, tenant, id, after).await?.ok_or_else(unknown)?;
+    let client = Present::sse_client();
     let frames = events.enumerate().map(move |(i, event)| {
+        let _here = &client;
         let event = event.inspect_err(|error| tracing::error!(job.id = %id, %error, "a stream broke off"))?;
+        metrics::event_sent(event.kind.name());
         let frame =
             sse::Event::default().id(event.seq.to_string()).event(event.kind.name()).data(event.data.to_string());
         Ok::<_, engine::EngineError>(if i == 0 { frame.retry(RETRY) } else { frame })

@@ -7,6 +7,7 @@ use crate::field::FieldError;
 use crate::field::input::{Description, FieldOptions};
 use crate::field::network::family::Family;
 use crate::job::{Failure, pipeline, spec};
+use crate::telemetry::metrics;
 use crate::tenant::Tenant;
 use axum::Json;
 use axum::body::Body;
@@ -105,6 +106,7 @@ pub async fn upload(
     let tenant = caller.may(Scope::Write)?;
     let options = reading_options(raw.as_deref())?;
     let bytes = body::read(body, app.limits.input_bytes).await?;
+    metrics::uploaded(bytes.len() as u64);
     let hashed = bytes.clone();
     let id = tokio::task::spawn_blocking(move || BlobId::of(&hashed)).await.map_err(joined)?;
     if let Some(mut known) = known(&app, tenant, id).await? {

@@ -12,6 +12,7 @@ use crate::field::{Fault, FieldError};
 use crate::job::spec::{FieldSpec, Fitting, Work};
 use crate::job::{Failure, Job, JobId, JobKind, JobSpec, OutputName, pipeline};
 use crate::shrink::Method;
+use crate::telemetry::metrics;
 use crate::tenant::Tenant;
 use axum::Json;
 use axum::body::Body;
@@ -19,7 +20,7 @@ use axum::extract::{Path, RawQuery, State};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// Characters of an idempotency key.
 const MAX_KEY: usize = 255;
@@ -55,7 +56,7 @@ pub struct Estimate {
     tag = "jobs",
     params(
         ("validate_only" = Option<bool>, Query, description = "check the request and estimate its cost, without submitting it"),
-        ("Idempotency-Key" = Option<String>, Header, description = "makes the submit repeatable for 24 hours"),
+        ("Idempotency-Key" = Option<String>, Header, min_length = 1, max_length = 255, pattern = "^[!-~]+$", description = "makes the submit repeatable for 24 hours"),
         ("Prefer" = Option<String>, Header, description = "`wait=N`: wait up to N seconds for the end"),
     ),
     request_body(content = JobRequest, content_type = "application/json"),
@@ -81,6 +82,7 @@ pub async fn submit(
     body: Body,
 ) -> Result<Response, Problem> {
     let tenant = caller.may(Scope::Write)?;
+    let clock = Instant::now();
     let parameters = query::parameters(raw.as_deref(), &["validate_only"], &[])?;
     let validate_only = query::flag(&parameters, "validate_only")?;
     let key = idempotency_key(&headers)?;
@@ -115,7 +117,15 @@ pub async fn submit(
     }
     let submitted = app.engine.submit(NewJob { tenant: tenant.clone(), id: JobId::new(), spec, key }).await?;
     drop(promise);
+    tell_accepted(&submitted, clock);
     answer_submit(&app, tenant, &headers, submitted).await
+}
+
+/// Counts a job that is new.
+fn tell_accepted(submitted: &Submitted, since: Instant) {
+    if let Submitted::Created(job) = submitted {
+        metrics::job_accepted(job.kind, since.elapsed());
+    }
 }
 
 /// The answer to a submit, after the wait that `Prefer` asks for.

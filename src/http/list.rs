@@ -19,6 +19,12 @@ const MAX_LIMIT: u64 = 200;
 /// Filters by label at most.
 const MAX_LABELS: usize = 16;
 
+/// A label that jobs must have: `name:value`.
+#[derive(utoipa::ToSchema)]
+#[schema(value_type = String, pattern = "^[^:]*:")]
+#[allow(dead_code, reason = "only described")]
+pub struct LabelFilter(String);
+
 /// A page of jobs.
 #[derive(Serialize, utoipa::ToSchema)]
 pub struct JobPage {
@@ -35,11 +41,11 @@ pub struct JobPage {
     tag = "jobs",
     params(
         ("state" = Option<Vec<State>>, Query, description = "only jobs in these states; may be repeated"),
-        ("label" = Option<Vec<String>>, Query, description = "only jobs with this label, `name:value`; may be repeated"),
-        ("created_from" = Option<String>, Query, description = "only jobs accepted at this time (RFC 3339) or later"),
-        ("created_to" = Option<String>, Query, description = "only jobs accepted before this time (RFC 3339)"),
-        ("limit" = Option<u64>, Query, description = "jobs of a page, 1 to 200, 50 when nothing is said"),
-        ("cursor" = Option<String>, Query, description = "from the page before, as it is"),
+        ("label" = Option<Vec<LabelFilter>>, Query, max_items = 16, description = "only jobs with this label, `name:value`; may be repeated"),
+        ("created_from" = Option<String>, Query, format = DateTime, description = "only jobs accepted at this time (RFC 3339) or later"),
+        ("created_to" = Option<String>, Query, format = DateTime, description = "only jobs accepted before this time (RFC 3339)"),
+        ("limit" = Option<u64>, Query, minimum = 1, maximum = 200, description = "jobs of a page, 1 to 200, 50 when nothing is said"),
+        ("cursor" = Option<String>, Query, pattern = "^[A-Za-z0-9_-]{21}[AQgw]$", description = "from the page before, as it is"),
     ),
     responses(
         (status = 200, description = "a page", body = JobPage, headers(("Link", description = "`rel=\"next\"`: the next page"))),

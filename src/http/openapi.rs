@@ -1,11 +1,15 @@
 //! The description of the service, made from the handlers.
 
+mod links;
+mod scene;
+
 use super::problem::ProblemDocument;
 use axum::Json;
 use utoipa::openapi::content::ContentBuilder;
-use utoipa::openapi::path::Operation;
+use utoipa::openapi::path::{Operation, Parameter};
+use utoipa::openapi::schema::{Array, Object, SchemaType, Type};
 use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityRequirement, SecurityScheme};
-use utoipa::openapi::{OpenApi, Ref, RefOr, Response};
+use utoipa::openapi::{OpenApi, Ref, RefOr, Response, Schema};
 use utoipa::{OpenApi as _, ToSchema as _};
 
 /// The media type of every answer that is not a success.
@@ -29,6 +33,7 @@ const PROBLEM: &str = "application/problem+json";
         crate::job::event::EventKind,
         crate::job::preview::MeshPreview,
         crate::job::ProgressView,
+        super::list::LabelFilter,
     )),
 )]
 struct Base;
@@ -38,7 +43,7 @@ pub(super) fn base() -> OpenApi {
     Base::openapi()
 }
 
-/// Gives every problem its body, and every operation the problems that any of them can have.
+/// Gives every problem its body, every operation the problems that any of them can have, and answers the links to what follows them.
 pub(super) fn complete(mut document: OpenApi) -> OpenApi {
     for (path, item) in &mut document.paths.paths {
         let operations =
@@ -48,6 +53,7 @@ pub(super) fn complete(mut document: OpenApi) -> OpenApi {
                 describe_caller(operation);
             }
             describe_problems(operation);
+            operation.parameters.iter_mut().flatten().for_each(never_null);
         }
         // the router answers HEAD from GET; both are one operation, which needs an own name in each method
         if let Some(head) = &mut item.head {
@@ -60,6 +66,8 @@ pub(super) fn complete(mut document: OpenApi) -> OpenApi {
         .build();
     let components = document.components.get_or_insert_default();
     components.add_security_scheme("bearer", SecurityScheme::Http(bearer));
+    links::add(&mut document);
+    scene::add(&mut document);
     document
 }
 
@@ -72,6 +80,20 @@ fn describe_caller(operation: &mut Operation) {
         ("403", "the key or token lacks a scope"),
     ] {
         operation.responses.responses.entry(status.to_owned()).or_insert_with(|| RefOr::T(Response::new(description)));
+    }
+}
+
+/// A parameter that is optional is left out; there is no null that could be sent.
+fn never_null(parameter: &mut RefOr<Parameter>) {
+    let RefOr::T(parameter) = parameter else { return };
+    if let Some(RefOr::T(Schema::Object(Object { schema_type, .. }) | Schema::Array(Array { schema_type, .. }))) =
+        &mut parameter.schema
+        && let SchemaType::Array(types) = schema_type
+    {
+        types.retain(|kind| *kind != Type::Null);
+        if let [one] = types.as_slice() {
+            *schema_type = SchemaType::Type(one.clone());
+        }
     }
 }
 

@@ -6,12 +6,14 @@ use super::{App, Problem, query};
 use crate::auth::{Caller, Scope};
 use crate::blobs::{BlobError, BlobId};
 use crate::job::OutputName;
+use crate::telemetry::metrics;
 use axum::body::Body;
 use axum::extract::{Path, RawQuery, State};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD;
+use futures::TryStreamExt;
 use jiff::Timestamp;
 
 /// What a job made never changes, and may be forgotten: a day in a private cache.
@@ -124,6 +126,8 @@ pub async fn download(
         Err(BlobError::Missing) => return Err(expired()),
         Err(error) => return Err(error.into()),
     };
-    let body = if method == Method::HEAD { Body::empty() } else { Body::from_stream(bytes) };
+    let name = kind.name();
+    let counted = bytes.inspect_ok(move |bytes| metrics::downloaded(name, bytes.len() as u64));
+    let body = if method == Method::HEAD { Body::empty() } else { Body::from_stream(counted) };
     Ok((status, answer, body).into_response())
 }

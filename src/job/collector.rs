@@ -10,6 +10,7 @@
 use crate::blobs::{BlobError, BlobId, Blobs};
 use crate::config::Retention;
 use crate::engine::{Engine, EngineError};
+use crate::telemetry::metrics;
 use futures::TryStreamExt;
 use jiff::Timestamp;
 use std::sync::Arc;
@@ -44,7 +45,10 @@ pub async fn run(engine: Arc<dyn Engine>, blobs: Blobs, retention: Retention, st
         };
         match collected {
             Ok(0) => {}
-            Ok(blobs) => tracing::info!(blobs, "what no job names any more was removed"),
+            Ok(blobs) => {
+                metrics::blobs_collected(blobs as u64);
+                tracing::info!(blobs, "what no job names any more was removed");
+            }
             Err(error) => tracing::warn!(%error, "what no job names any more could not be removed"),
         }
     }

@@ -14,6 +14,7 @@ use crate::fit::FitSpec;
 use crate::shrink::ShrinkSpec;
 use crate::shrink::curve::{MAX_SAMPLES, MIN_SAMPLES};
 use crate::shrink::lattice::LatticeSpec;
+use crate::telemetry::traces::TRACEPARENT;
 use read::{Faults, read_spec};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
@@ -181,6 +182,9 @@ pub struct JobSpec {
     pub outputs: Vec<OutputName>,
     /// Names the client gives the job; jobs can be listed by them.
     pub labels: BTreeMap<String, String>,
+    /// Where the request was in its trace, so that the worker continues it: known to the engine only, no client can say it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub traceparent: Option<String>,
 }
 
 /// What a job does, by its kind.
@@ -284,6 +288,16 @@ pub struct Shrinking {
 }
 
 impl JobSpec {
+    /// Reads what an engine stored.
+    ///
+    /// # Errors
+    /// As [`from_value`](Self::from_value): it was stored by a version that knew more.
+    pub fn from_stored(mut value: Value) -> Result<Self, Vec<Fault>> {
+        let traceparent = value.as_object_mut().and_then(|members| members.remove(TRACEPARENT));
+        let spec = Self::from_value(&value)?;
+        Ok(Self { traceparent: traceparent.and_then(|text| text.as_str().map(str::to_owned)), ..spec })
+    }
+
     /// Reads a request.
     ///
     /// # Errors

@@ -1,25 +1,29 @@
 //! The worker: claims jobs, runs them on the rayon pool, tells their news, and ends them.
 //!
-//! Computing happens on blocking threads and on the pool, never on the async runtime. A worker takes exactly as many jobs as
+//! Computing happens on threads of its own and on the pool, never on the async runtime, and [gives way](priority) to it. A worker takes exactly as many jobs as
 //! it has free slots, renews each claim every third of its lease, and stops a computation within a heartbeat of losing it.
 
 use super::failure::{Ended, Failure};
 use super::preview::MeshPreview;
+use super::priority;
 use super::spec::{FieldSpec, Work};
-use super::{EventKind, Output, OutputName, ProgressView};
+use super::{EventKind, JobId, Output, OutputName, ProgressView};
 use crate::blobs::{BlobError, BlobId, Blobs};
 use crate::engine::{Claim, Engine, EngineError, Outcome, Renewal, Update};
 use crate::job::pipeline::{self, Asked, Kept, StateBytes};
 use crate::settings::{CancelToken, Progress, Settings};
+use crate::telemetry::metrics::{self, Present};
+use crate::telemetry::traces;
 use bytes::Bytes;
 use std::cell::Cell;
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use tokio::sync::mpsc;
 use tokio::time::Interval;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 use tracing::Instrument as _;
+use tracing::field::Empty;
 
 /// Least time between two progress events of a job.
 const PROGRESS_EVERY: Duration = Duration::from_millis(100);
@@ -86,7 +90,12 @@ impl Worker {
             };
             for (claim, permit) in claims.into_iter().zip(permits) {
                 let (worker, give_back) = (worker.clone(), give_back.clone());
-                let span = tracing::info_span!("job", job.id = %claim.id, job.attempt = claim.attempt);
+                let span =
+                    tracing::info_span!("job", job.id = %claim.id, job.attempt = claim.attempt, trace.id = Empty);
+                traces::join(&span, claim.spec.traceparent.as_deref());
+                if let Some(position) = traces::position(&span) {
+                    span.record("trace.id", traces::trace_id(&position));
+                }
                 jobs.spawn(
                     async move {
                         worker.attempt(claim, give_back).await;
@@ -118,6 +127,16 @@ impl Worker {
     /// Runs one attempt from claim to end.
     async fn attempt(&self, claim: Claim, give_back: CancellationToken) {
         tracing::info!("job started");
+        let (_running, clock, kind) = (Present::running_job(), Instant::now(), claim.spec.work.kind());
+        if claim.attempt == 1 {
+            metrics::job_began(kind, since_accepted(claim.id));
+        }
+        let outcome = self.run_attempt(claim, give_back).await;
+        metrics::attempt_ended(kind, outcome, clock.elapsed());
+    }
+
+    /// Does what [`attempt`](Self::attempt) says; returns how it ended, in a word.
+    async fn run_attempt(&self, claim: Claim, give_back: CancellationToken) -> &'static str {
         let cancel = CancelToken::new();
         let (news, mut inbox) = mpsc::unbounded_channel();
         let mut work = tokio::spawn(self.work(claim.clone(), cancel.clone(), news).in_current_span());
@@ -159,7 +178,7 @@ impl Worker {
         });
         if lost {
             tracing::warn!("the claim was lost; nothing of this attempt counts");
-            return;
+            return "lost";
         }
         // nothing that a record names may be removed from here until the record names it
         let promise = self.blobs.promise().await;
@@ -172,10 +191,10 @@ impl Worker {
         };
         let Some(outcome) = outcome else {
             tracing::warn!("the blob store is out of reach; the job is left to the next attempt");
-            return;
+            return "unfinished";
         };
         let over = !matches!(outcome, Outcome::Released);
-        self.end(&claim, outcome).await;
+        let ended = self.end(&claim, outcome).await;
         if over
             && matches!(claim.spec.work, Work::Fit(_))
             && let Err(error) = self.blobs.remove_checkpoint(&claim.tenant, &claim.id.to_string()).await
@@ -183,6 +202,7 @@ impl Worker {
             tracing::warn!(%error, "the checkpoint of an ended job could not be removed");
         }
         drop(promise);
+        ended
     }
 
     /// Does what may take long at the end without losing the claim over it.
@@ -277,8 +297,8 @@ impl Worker {
                     }
                 }
             };
-            let made = tokio::task::spawn_blocking(compute).await.unwrap_or_else(|panic| {
-                tracing::error!(%panic, "the computation panicked");
+            let made = priority::compute(compute).await.unwrap_or_else(|| {
+                tracing::error!("the computation panicked");
                 Err(Failure::internal().into())
             });
             made.map_err(Unfinished::Ended)
@@ -313,7 +333,8 @@ impl Worker {
         })
     }
 
-    async fn end(&self, claim: &Claim, outcome: Outcome) {
+    /// Writes the end of an attempt; returns it in a word.
+    async fn end(&self, claim: &Claim, outcome: Outcome) -> &'static str {
         for _ in 0..FINISH_TRIES {
             match self.engine.finish(claim, outcome.clone()).await {
                 Ok(()) => {
@@ -323,12 +344,17 @@ impl Worker {
                         Outcome::Canceled => ("canceled", ""),
                         Outcome::Released => ("released", ""),
                     };
+                    if let Outcome::Succeeded { metrics, .. } | Outcome::Failed { metrics: Some(metrics), .. } =
+                        &outcome
+                    {
+                        metrics::job_reported(metrics);
+                    }
                     tracing::info!(job.outcome = ended, problem.code = code, "job ended");
-                    return;
+                    return ended;
                 }
                 Err(EngineError::Fenced { .. }) => {
                     tracing::warn!("the claim was lost at the end; nothing of this attempt counts");
-                    return;
+                    return "lost";
                 }
                 Err(error) => {
                     tracing::error!(%error, "the end of the job could not be written");
@@ -336,7 +362,15 @@ impl Worker {
                 }
             }
         }
+        "unfinished"
     }
+}
+
+/// Time since a job was named, which is when it was accepted. The clock of the node that accepted it may be ahead.
+fn since_accepted(id: JobId) -> Duration {
+    let named = id.0.get_timestamp().map_or((0, 0), |time| time.to_unix());
+    let named = UNIX_EPOCH + Duration::new(named.0, named.1);
+    SystemTime::now().duration_since(named).unwrap_or_default()
 }
 
 /// The bytes of an input that a job names.

@@ -112,7 +112,7 @@ async fn take_up(node: &Node, name: &Name, worker: &str) -> Result<Option<Claim>
     });
     let Some((true, record)) = taken.await? else { return Ok(None) };
     let (Name { tenant, id }, attempt) = (name.clone(), record.job.attempt);
-    match request.as_ref().map(JobSpec::from_value) {
+    match request.map(JobSpec::from_stored) {
         Some(Ok(spec)) => Ok(Some(Claim { tenant, id, attempt, spec, worker: worker.to_owned(), lease })),
         unreadable => {
             // accepted by another version that knew more

@@ -59,6 +59,11 @@ impl Feed {
         Ok(feed)
     }
 
+    /// Number of the last entry that came.
+    pub(super) fn position(&self) -> u64 {
+        self.position.borrow().seq
+    }
+
     /// Whether every entry up to this one is in the projection, after a wait of at most `patience`.
     pub(super) async fn reaches(&self, seq: u64, patience: Duration) -> bool {
         let mut position = self.position.clone();

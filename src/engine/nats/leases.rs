@@ -14,6 +14,7 @@ use super::projection::Seen;
 use super::record::{Draft, Record};
 use crate::engine::EngineError;
 use crate::job::State;
+use crate::telemetry::metrics;
 
 /// Takes the jobs from workers that were not heard of for the time of their lease.
 pub(super) async fn take_from_the_lost(node: &Node) {
@@ -37,6 +38,7 @@ async fn take(node: &Node, seen: &Seen) -> Result<(), EngineError> {
         // the worker lives, or another node was faster: reading it shows the entry that was missed
         return node.ledger.read(&name).await.map(|_| ());
     };
+    metrics::attempts_lost(1);
     tracing::warn!(job.id = %name.id, losses = record.losses, "a worker was lost");
     if record.job.state == State::Queued {
         node.enqueue(&name).await;

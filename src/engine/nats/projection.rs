@@ -15,7 +15,7 @@ use crate::engine::sqlite::records::{self, Ctx, KEPT_EVENTS};
 use crate::engine::sqlite::writer::{Hub, Writer};
 use crate::engine::sqlite::{Readers, schema};
 use crate::engine::{EngineError, EventPage, ListQuery, Page};
-use crate::job::{Event, JobId};
+use crate::job::{Event, JobId, JobKind, State};
 use crate::tenant::Tenant;
 use jiff::Timestamp;
 use rusqlite::{Connection, OptionalExtension, params};
@@ -98,6 +98,11 @@ impl Projection {
 
     pub(super) fn subscribe(&self, tenant: &Tenant, id: JobId) -> broadcast::Receiver<Arc<Event>> {
         self.hub.subscribe(tenant, id)
+    }
+
+    /// How many jobs there are of each kind in each state that is no end, and when the oldest queued one was accepted.
+    pub(super) async fn depth(&self) -> Result<(Vec<(JobKind, State, u64)>, Option<Timestamp>), EngineError> {
+        self.readers.run(records::depth).await
     }
 
     pub(super) async fn list(&self, tenant: &Tenant, query: ListQuery) -> Result<Page, EngineError> {

@@ -216,6 +216,27 @@ pub(in crate::engine) fn list(connection: &Connection, tenant: &Tenant, query: &
     Ok(Page { jobs, more })
 }
 
+/// How many jobs there are of each kind in each state that is no end, and when the oldest queued one was accepted.
+pub(in crate::engine) fn depth(
+    connection: &Connection,
+) -> rusqlite::Result<(Vec<(JobKind, State, u64)>, Option<Timestamp>)> {
+    let text = "SELECT kind, state, COUNT(*), MIN(created_at) FROM jobs
+                WHERE state IN ('queued', 'running', 'canceling') GROUP BY kind, state";
+    let mut statement = connection.prepare_cached(text)?;
+    let mut rows = statement.query([])?;
+    let (mut open, mut oldest) = (Vec::new(), None::<i64>);
+    while let Some(row) = rows.next()? {
+        let (kind, state): (String, String) = (row.get(0)?, row.get(1)?);
+        let (Some(kind), Some(state)) = (JobKind::from_name(&kind), State::from_name(&state)) else { continue };
+        open.push((kind, state, row.get(2)?));
+        if state == State::Queued {
+            let first: i64 = row.get(3)?;
+            oldest = Some(oldest.map_or(first, |oldest| oldest.min(first)));
+        }
+    }
+    Ok((open, oldest.map(time).transpose()?))
+}
+
 /// Moves a job to another state and tells it; a job that ends tells its whole record last.
 pub(super) fn change(ctx: &mut Ctx<'_>, id: JobId, change: Change) -> rusqlite::Result<()> {
     let finished = change.state.ended().then_some(ctx.now);

@@ -1,6 +1,6 @@
 //! `/v1/jobs/{id}/sensitivity`: how a loss of a job's surface changes with the network that it came from.
 
-use super::{App, Problem, answer_submit, body, idempotency_key, job_id, query, surface_blob};
+use super::{App, Problem, answer_submit, body, idempotency_key, job_id, query, surface_blob, tell_accepted};
 use crate::auth::{Caller, Scope};
 use crate::blobs::BlobId;
 use crate::engine::{IdempotencyKey, NewJob};
@@ -13,6 +13,7 @@ use axum::extract::{Path, RawQuery, State};
 use axum::http::HeaderMap;
 use axum::response::Response;
 use std::collections::BTreeMap;
+use std::time::Instant;
 
 /// Differentiates a job's surface
 ///
@@ -26,7 +27,7 @@ use std::collections::BTreeMap;
     tag = "jobs",
     params(
         ("id" = String, Path, description = "a job of the kind `shrink` that succeeded, of a network, with the output `surface`"),
-        ("Idempotency-Key" = Option<String>, Header, description = "makes the request repeatable for 24 hours"),
+        ("Idempotency-Key" = Option<String>, Header, min_length = 1, max_length = 255, pattern = "^[!-~]+$", description = "makes the request repeatable for 24 hours"),
         ("Prefer" = Option<String>, Header, description = "`wait=N`: wait up to N seconds for the end"),
     ),
     request_body(content = Vec<u8>, content_type = "application/octet-stream", description = "the gradient"),
@@ -53,6 +54,7 @@ pub async fn differentiate(
     body: Body,
 ) -> Result<Response, Problem> {
     let tenant = caller.may(Scope::Write)?;
+    let clock = Instant::now();
     query::parameters(raw.as_deref(), &[], &[])?;
     let key = idempotency_key(&headers)?;
     let id = job_id(&id)?;
@@ -81,9 +83,11 @@ pub async fn differentiate(
     let mut sensing = sensing(&app, tenant, &job).await?;
     sensing.gradient = app.blobs.put_unseen(bytes).await?;
     let outputs = OutputName::of(JobKind::Sensitivity).to_vec();
-    let spec = JobSpec { work: Work::Sensitivity(Box::new(sensing)), outputs, labels: BTreeMap::new() };
+    let spec =
+        JobSpec { work: Work::Sensitivity(Box::new(sensing)), outputs, labels: BTreeMap::new(), traceparent: None };
     let submitted = app.engine.submit(NewJob { tenant: tenant.clone(), id: JobId::new(), spec, key }).await?;
     drop(promise);
+    tell_accepted(&submitted, clock);
     answer_submit(&app, tenant, &headers, submitted).await
 }
 
