@@ -76,23 +76,25 @@ pub fn document() -> utoipa::openapi::OpenApi {
     openapi::complete(api().into_openapi())
 }
 
-/// What a node that only runs jobs answers: whether it lives and is ready.
-pub fn health_router(app: App) -> axum::Router {
+/// What a node that only runs jobs answers: whether it lives and is ready. `others` are routes that get the same around them.
+pub fn health_router(app: App, others: axum::Router) -> axum::Router {
     let (router, _) = OpenApiRouter::<App>::default()
         .routes(routes!(health::livez))
         .routes(routes!(health::readyz))
         .split_for_parts();
     let router = router.fallback(problem::unknown_route).method_not_allowed_fallback(problem::wrong_method);
-    router.with_state(app).layer(middleware::from_fn(context::request))
+    router.with_state(app).merge(others).layer(middleware::from_fn(context::request))
 }
 
-/// The service. Browsers of other origins are let in only when `cors_origins` names them.
-pub fn router(app: App, cors_origins: &[String]) -> axum::Router {
+/// The service. Browsers of other origins are let in only when `cors_origins` names them. `others` are routes that get the same
+/// around them.
+pub fn router(app: App, cors_origins: &[String], others: axum::Router) -> axum::Router {
     let (router, _) = api().split_for_parts();
     let mut router = router
         .fallback(problem::unknown_route)
         .method_not_allowed_fallback(problem::wrong_method)
         .with_state(app)
+        .merge(others)
         .layer(CatchPanicLayer::custom(problem::panicked));
     if !cors_origins.is_empty() {
         let origins: Vec<HeaderValue> = cors_origins.iter().filter_map(|o| o.parse().ok()).collect();

@@ -8,6 +8,7 @@ pub mod engine;
 pub mod extract;
 pub mod field;
 pub mod fit;
+pub mod grpc;
 pub mod http;
 pub mod job;
 pub mod measure;

@@ -4,6 +4,7 @@ use super::open_engine::open_engine;
 use super::{BAD_USAGE, FAILED, ServeArgs, fail, first_job};
 use crate::blobs::Blobs;
 use crate::config::{Config, FOLDER, Role, SQLITE};
+use crate::grpc;
 use crate::http::{self, App};
 use crate::job::collector;
 use crate::job::worker::Worker;
@@ -123,9 +124,10 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
         stop: stop.clone(),
     };
     let router = match config.role {
-        Role::Worker => http::health_router(app),
-        Role::All | Role::Api => http::router(app, &config.cors_origins),
+        Role::Worker => http::health_router(app.clone(), grpc::health_routes(app)),
+        Role::All | Role::Api => http::router(app.clone(), &config.cors_origins, grpc::routes(app)),
     };
+    let router = router.layer(axum::middleware::from_fn(grpc::speak));
     let routes = router.clone();
     let graceful = axum::serve(listener, router).with_graceful_shutdown(stop.clone().cancelled_owned());
     let server = tokio::spawn(graceful.into_future());

@@ -17,10 +17,11 @@ use axum::extract::{Path, RawQuery, State};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
+use serde_json::Value;
 use std::time::Duration;
 
 /// Characters of an idempotency key.
-const MAX_KEY: usize = 255;
+pub(crate) const MAX_KEY: usize = 255;
 /// Longest hint to come back, seconds: an estimate far ahead is not worth more trust.
 const MAX_RETRY_AFTER: f64 = 30.0;
 /// Evaluations per vertex of the adaptive method, the median over the table of `benches/extract_table.py`.
@@ -38,9 +39,9 @@ pub struct Estimate {
     /// Whether the request would be accepted; always true here, a faulty one is a 422.
     valid: bool,
     /// Vertices of the result.
-    vertices: u64,
+    pub(crate) vertices: u64,
     /// Field evaluations, estimated.
-    evaluations: u64,
+    pub(crate) evaluations: u64,
 }
 
 /// Submits a job
@@ -81,42 +82,75 @@ pub async fn submit(
     let validate_only = query::flag(&parameters, "validate_only")?;
     let key = idempotency_key(&headers)?;
     let request = body::read_json(&headers, body, app.limits.body_bytes).await?;
+    if validate_only {
+        return Ok(Json(judge(&app, &request).await?).into_response());
+    }
+    answer_submit(&app, &headers, accept(&app, &request, key).await?).await
+}
+
+/// A job that was accepted, now or by an earlier request with the same key.
+pub(crate) struct Accepted {
+    /// The job as it was accepted.
+    pub job: Job,
+    /// Whether an earlier request did.
+    pub replayed: bool,
+}
+
+/// Estimates what a request would cost, checking it as if it were submitted.
+pub(crate) async fn judge(app: &App, request: &Value) -> Result<Estimate, Problem> {
+    let spec = read(request)?;
+    let _promise = app.blobs.promise().await;
+    let (spec, dimension) = look_up(app, spec, request).await?;
+    Ok(estimate(&spec, dimension))
+}
+
+/// Accepts a request for a job, whatever way it came: the job is durable before this returns.
+pub(crate) async fn accept(app: &App, request: &Value, key: Option<String>) -> Result<Accepted, Problem> {
+    let spec = read(request)?;
     // the keys of a JSON value are sorted, so that spaces and order do not make another request
     let fingerprint = BlobId::of(request.to_string().as_bytes()).hex();
-    let spec = JobSpec::from_value(&request).map_err(|faults| Problem::invalid_request("", &faults))?;
-    if spec.work.kind() == JobKind::Sensitivity {
-        let detail = "a sensitivity is asked for by POST /v1/jobs/{id}/sensitivity".to_owned();
-        let fault = Fault { pointer: "/kind".to_owned(), code: "not_offered", detail };
-        return Err(Problem::invalid_request("", &[fault]));
-    }
     let key = key.map(|key| IdempotencyKey { key, fingerprint });
     // a repeated request has its answer, also when what it named is gone by now
-    if let Some(key) = key.as_ref().filter(|_| !validate_only)
+    if let Some(key) = &key
         && let Some(answer) = app.engine.recall(key.clone()).await?
     {
-        return answer_submit(&app, &headers, answer).await;
+        return accepted(answer);
     }
     // no blob goes from the moment that it is looked up until the new job's record names it
     let promise = app.blobs.promise().await;
-    let dimension = check_fields(&app, &spec).await?;
-    let mut spec = spec.for_dimension(dimension, &request).map_err(|faults| Problem::invalid_request("", &faults))?;
-    if matches!(&spec.work, Work::Shrink(work) if work.warm_start.is_some()) {
-        warm_start::resolve(&app, &mut spec).await?;
-    }
-    if validate_only {
-        return Ok(Json(estimate(&spec, dimension)).into_response());
-    }
+    let (spec, _) = look_up(app, spec, request).await?;
     if app.stop.is_cancelled() {
         return Err(Problem::unavailable("stopping", "the service is stopping"));
     }
     let submitted = app.engine.submit(NewJob { id: JobId::new(), spec, key }).await?;
     drop(promise);
-    answer_submit(&app, &headers, submitted).await
+    accepted(submitted)
 }
 
-/// The answer to a submit, after the wait that `Prefer` asks for.
-async fn answer_submit(app: &App, headers: &HeaderMap, submitted: Submitted) -> Result<Response, Problem> {
-    let (mut job, replayed) = match submitted {
+/// Reads a request for a job; what it names is not looked up yet.
+fn read(request: &Value) -> Result<JobSpec, Problem> {
+    let spec = JobSpec::from_value(request).map_err(|faults| Problem::invalid_request("", &faults))?;
+    if spec.work.kind() == JobKind::Sensitivity {
+        let detail = "a sensitivity is asked for by POST /v1/jobs/{id}/sensitivity".to_owned();
+        let fault = Fault { pointer: "/kind".to_owned(), code: "not_offered", detail };
+        return Err(Problem::invalid_request("", &[fault]));
+    }
+    Ok(spec)
+}
+
+/// Looks up everything that a request names, and completes it. Tells the field's dimension, too.
+async fn look_up(app: &App, spec: JobSpec, request: &Value) -> Result<(JobSpec, u8), Problem> {
+    let dimension = check_fields(app, &spec).await?;
+    let mut spec = spec.for_dimension(dimension, request).map_err(|faults| Problem::invalid_request("", &faults))?;
+    if matches!(&spec.work, Work::Shrink(work) if work.warm_start.is_some()) {
+        warm_start::resolve(app, &mut spec).await?;
+    }
+    Ok((spec, dimension))
+}
+
+/// What the engine made of a submit.
+fn accepted(submitted: Submitted) -> Result<Accepted, Problem> {
+    let (job, replayed) = match submitted {
         Submitted::Created(job) => (job, false),
         Submitted::Replayed(job) => (job, true),
         Submitted::KeyConflict => {
@@ -133,6 +167,12 @@ async fn answer_submit(app: &App, headers: &HeaderMap, submitted: Submitted) -> 
         }
     };
     tracing::info!(job.id = %job.id, replayed, "job submitted");
+    Ok(Accepted { job, replayed })
+}
+
+/// The answer to a submit, after the wait that `Prefer` asks for.
+async fn answer_submit(app: &App, headers: &HeaderMap, accepted: Accepted) -> Result<Response, Problem> {
+    let Accepted { mut job, replayed } = accepted;
     let mut answer = HeaderMap::new();
     let location = HeaderValue::from_str(&format!("/v1/jobs/{}", job.id)).map_err(|_| Problem::internal())?;
     answer.insert(header::LOCATION, location);
@@ -211,11 +251,17 @@ pub async fn cancel(
     RawQuery(raw): RawQuery,
 ) -> Result<Response, Problem> {
     query::parameters(raw.as_deref(), &[], &[])?;
-    let id = job_id(&id)?;
-    let job = app.engine.request_cancel(id).await?.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
-    tracing::info!(job.id = %id, job.state = job.state.name(), "cancel requested");
+    let job = request_cancel(&app, &id).await?;
     let status = if job.state.ended() { StatusCode::OK } else { StatusCode::ACCEPTED };
     Ok((status, job_answer(job)).into_response())
+}
+
+/// Asks for a job to be stopped. The record afterwards.
+pub(crate) async fn request_cancel(app: &App, id: &str) -> Result<Job, Problem> {
+    let id = job_id(id)?;
+    let job = app.engine.request_cancel(id).await?.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
+    tracing::info!(job.id = %id, job.state = job.state.name(), "cancel requested");
+    Ok(job)
 }
 
 /// Forgets a job and its outputs
@@ -237,7 +283,13 @@ pub async fn forget(
     RawQuery(raw): RawQuery,
 ) -> Result<StatusCode, Problem> {
     query::parameters(raw.as_deref(), &[], &[])?;
-    let id = job_id(&id)?;
+    remove(&app, &id).await?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+/// Forgets an ended job, and the blobs that no other job names.
+pub(crate) async fn remove(app: &App, id: &str) -> Result<(), Problem> {
+    let id = job_id(id)?;
     // no job may come to name a blob between the two steps
     let _sweep = app.blobs.sweep().await;
     match app.engine.forget(id).await? {
@@ -247,7 +299,7 @@ pub async fn forget(
             }
             app.blobs.remove_checkpoint(&id.to_string()).await?;
             tracing::info!(job.id = %id, "job forgotten");
-            Ok(StatusCode::NO_CONTENT)
+            Ok(())
         }
         Forgotten::Running => {
             let detail = "cancel the job first, or wait for its end";
@@ -258,7 +310,7 @@ pub async fn forget(
 }
 
 /// The job of that name; what is no name is a job that is not there.
-pub(super) fn job_id(text: &str) -> Result<JobId, Problem> {
+pub(crate) fn job_id(text: &str) -> Result<JobId, Problem> {
     text.parse().map_err(|_| Problem::unknown_job(text))
 }
 
@@ -298,11 +350,17 @@ async fn wait_until(app: &App, id: JobId, wait: Duration, done: impl Fn(&Job) ->
 fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, Problem> {
     let mut keys = headers.get_all("idempotency-key").iter();
     let Some(key) = keys.next() else { return Ok(None) };
-    let text = key.to_str().ok().filter(|k| !k.trim().is_empty() && k.len() <= MAX_KEY);
-    match (text, keys.next()) {
-        (Some(text), None) => Ok(Some(text.trim().to_owned())),
+    match (key.to_str().ok().and_then(read_key), keys.next()) {
+        (Some(key), None) => Ok(Some(key)),
         _ => Err(Problem::header(format!("Idempotency-Key: expected one key of 1 to {MAX_KEY} visible characters"))),
     }
+}
+
+/// A key as it is kept; `None` for what is none.
+pub(crate) fn read_key(text: &str) -> Option<String> {
+    let visible = |b: u8| b == b'\t' || (b' '..=b'~').contains(&b);
+    let is_key = !text.trim().is_empty() && text.len() <= MAX_KEY && text.bytes().all(visible);
+    is_key.then(|| text.trim().to_owned())
 }
 
 /// Checks what the field and the weight name. Tells the field's dimension.

@@ -5,7 +5,7 @@ use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
 
 #[path = "../support/nats_server.rs"]
-mod nats_server;
+pub mod nats_server;
 
 #[tokio::test]
 async fn two_processes_are_one_service() {

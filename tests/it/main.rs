@@ -12,6 +12,7 @@ mod curves;
 mod evaluate;
 mod faults;
 mod fit;
+mod grpc;
 mod losses;
 mod metrics;
 mod reading;

@@ -1,6 +1,6 @@
 //! `/v1/jobs/{id}/sensitivity`: how a loss of a job's surface changes with the network that it came from.
 
-use super::{App, Problem, answer_submit, body, idempotency_key, job_id, query, surface_blob};
+use super::{App, Problem, accepted, answer_submit, body, idempotency_key, job_id, query, surface_blob};
 use crate::blobs::BlobId;
 use crate::engine::{IdempotencyKey, NewJob};
 use crate::job::spec::{Sensing, Work};
@@ -66,7 +66,7 @@ pub async fn differentiate(
     if let Some(key) = &key
         && let Some(answer) = app.engine.recall(key.clone()).await?
     {
-        return answer_submit(&app, &headers, answer).await;
+        return answer_submit(&app, &headers, accepted(answer)?).await;
     }
     if app.stop.is_cancelled() {
         return Err(Problem::unavailable("stopping", "the service is stopping"));
@@ -80,7 +80,7 @@ pub async fn differentiate(
     let spec = JobSpec { work: Work::Sensitivity(Box::new(sensing)), outputs, labels: BTreeMap::new() };
     let submitted = app.engine.submit(NewJob { id: JobId::new(), spec, key }).await?;
     drop(promise);
-    answer_submit(&app, &headers, submitted).await
+    answer_submit(&app, &headers, accepted(submitted)?).await
 }
 
 /// What is differentiated of a job, with its surface in the place of the gradient.
