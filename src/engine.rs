@@ -4,7 +4,8 @@
 //! is held by one worker at a time, in attempts that are numbered from 1; only the newest attempt can change it, and it ends
 //! once; its events are numbered from 1 without a gap, and are durable before anyone reads them.
 //! Not guaranteed: that a job runs only once (a worker that is lost in the middle is followed by another attempt), and that
-//! old events are kept (a reader that comes too late gets a fresh snapshot).
+//! old events are kept (a reader that comes too late gets a fresh snapshot). Whoever is to be told of an end is owed that from the
+//! moment of the end, and until somebody settles it.
 
 pub mod conformance;
 pub mod nats;
@@ -130,6 +131,17 @@ pub struct Update {
     pub progress: Option<ProgressView>,
 }
 
+/// The end of a job that somebody is to be told.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DueNotice {
+    /// The job, which has ended.
+    pub job: Job,
+    /// Who is to be told.
+    pub url: String,
+    /// Attempts to tell it, this one included.
+    pub attempts: u32,
+}
+
 /// What a renewal found.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Renewal {
@@ -230,6 +242,12 @@ pub trait Engine: Send + Sync {
     async fn events_after(&self, id: JobId, after: u64, limit: usize) -> Result<Option<EventPage>, EngineError>;
     /// The job's events from now on. Every change of a record is told by an event.
     fn changes(&self, id: JobId) -> Changes;
+    /// Takes up to `limit` ends of jobs that somebody is to be told, the one that waits longest first. Each is whose took it for
+    /// the time of `hold`, and then due again unless it was settled. It became due in the same step in which its job ended.
+    async fn take_notices(&self, limit: usize, hold: Duration) -> Result<Vec<DueNotice>, EngineError>;
+    /// Notes what became of an attempt: the end is told again at `next`, or not any more. Nothing is noted of an attempt that was
+    /// followed by another.
+    async fn settle_notice(&self, id: JobId, attempts: u32, next: Option<Timestamp>) -> Result<(), EngineError>;
     /// Whether the engine can do its work.
     async fn health(&self) -> Result<(), EngineError>;
 }

@@ -23,6 +23,7 @@ pub use problem::Problem;
 use crate::blobs::Blobs;
 use crate::config::{Limits, Retention};
 use crate::engine::Engine;
+use crate::notify::target::Rules;
 use axum::http::HeaderValue;
 use axum::middleware;
 use std::sync::Arc;
@@ -46,6 +47,8 @@ pub struct App {
     pub retention: Retention,
     /// How long a link into the bucket is good for that a download is answered with; zero sends the bytes.
     pub download_link: Duration,
+    /// Who may be told of the ends of jobs; none where nobody is.
+    pub webhooks: Option<Rules>,
     /// Raised when the service stops.
     pub stop: CancellationToken,
 }

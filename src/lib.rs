@@ -12,6 +12,7 @@ pub mod grpc;
 pub mod http;
 pub mod job;
 pub mod measure;
+pub mod notify;
 pub mod settings;
 pub mod shrink;
 pub mod surface;

@@ -8,6 +8,8 @@ use crate::grpc;
 use crate::http::{self, App};
 use crate::job::collector;
 use crate::job::worker::Worker;
+use crate::notify::courier::{Courier, SystemNames};
+use crate::notify::target::Rules;
 use crate::telemetry;
 use serde::Serialize;
 use std::path::PathBuf;
@@ -115,12 +117,19 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
     };
     let worker = (config.role != Role::Api).then(|| tokio::spawn(worker().run(stop.clone())));
     tokio::spawn(collector::run(engine.clone(), blobs.clone(), config.retention, stop.clone()));
+    let courier = if config.role == Role::Worker || config.webhooks.secrets.is_empty() {
+        None
+    } else {
+        let courier = Courier::new(&config.webhooks, Arc::new(SystemNames))?;
+        Some(tokio::spawn(courier.run(engine.clone(), stop.clone())))
+    };
     let app = App {
         engine,
         blobs,
         limits: config.limits.clone(),
         retention: config.retention,
         download_link: Duration::from_secs(config.download_link_s),
+        webhooks: (!config.webhooks.secrets.is_empty()).then(|| Rules::from(&config.webhooks)),
         stop: stop.clone(),
     };
     let router = match config.role {
@@ -145,6 +154,9 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
     let drained = async {
         if let Some(worker) = worker {
             worker.await?;
+        }
+        if let Some(courier) = courier {
+            courier.await?;
         }
         server.await??;
         Ok::<_, Box<dyn std::error::Error>>(())

@@ -12,6 +12,7 @@
 //! | lost workers are found | every node watches heartbeats by its own clock (`leases`) |
 //! | events have no gap | they are stored with the record, in one message (`record`) |
 //! | one key, one job | a key names its job, and whoever finds it makes that job (`keys`) |
+//! | an end is told | what is owed is stored with the end, in its record (`notices`) |
 //!
 //! Not guaranteed beyond what the [room](super) says: a list on one node shows what was submitted on another only once its
 //! feed has brought it, usually within milliseconds; and a job that comes back to the queue waits behind those that are there.
@@ -26,6 +27,7 @@ mod layout;
 mod leases;
 mod ledger;
 mod link;
+mod notices;
 mod projection;
 mod queue;
 mod record;
@@ -36,8 +38,8 @@ mod tests;
 pub use address::{Address, InvalidAddress, SCHEMES};
 
 use super::{
-    Changes, Claim, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Page,
-    Renewal, Submitted, Terms, Update,
+    Changes, Claim, DueNotice, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome,
+    Page, Renewal, Submitted, Terms, Update,
 };
 use crate::job::{Job, JobId, JobSpec, State};
 use feed::Feed;
@@ -344,6 +346,17 @@ impl Engine for NatsEngine {
 
     async fn events_after(&self, id: JobId, after: u64, limit: usize) -> Result<Option<EventPage>, EngineError> {
         patiently(self.node.events_after(id, after, limit)).await
+    }
+
+    async fn take_notices(&self, limit: usize, hold: Duration) -> Result<Vec<DueNotice>, EngineError> {
+        if limit == 0 {
+            return Ok(Vec::new());
+        }
+        patiently(notices::take(&self.node.ledger, limit, hold)).await
+    }
+
+    async fn settle_notice(&self, id: JobId, attempts: u32, next: Option<Timestamp>) -> Result<(), EngineError> {
+        patiently(notices::settle(&self.node.ledger, id, attempts, next)).await
     }
 
     fn changes(&self, id: JobId) -> Changes {

@@ -8,8 +8,9 @@ use super::{App, Problem, body, conditional, query};
 use crate::blobs::BlobId;
 use crate::engine::{Forgotten, IdempotencyKey, NewJob, Submitted};
 use crate::field::{Fault, FieldError};
-use crate::job::spec::{FieldSpec, Fitting, Work};
+use crate::job::spec::{FieldSpec, Fitting, WebhookSpec, Work};
 use crate::job::{Failure, Job, JobId, JobKind, JobSpec, OutputName, pipeline};
+use crate::notify::target::Rules;
 use crate::shrink::Method;
 use axum::Json;
 use axum::body::Body;
@@ -98,7 +99,7 @@ pub(crate) struct Accepted {
 
 /// Estimates what a request would cost, checking it as if it were submitted.
 pub(crate) async fn judge(app: &App, request: &Value) -> Result<Estimate, Problem> {
-    let spec = read(request)?;
+    let spec = read(app, request)?;
     let _promise = app.blobs.promise().await;
     let (spec, dimension) = look_up(app, spec, request).await?;
     Ok(estimate(&spec, dimension))
@@ -106,7 +107,7 @@ pub(crate) async fn judge(app: &App, request: &Value) -> Result<Estimate, Proble
 
 /// Accepts a request for a job, whatever way it came: the job is durable before this returns.
 pub(crate) async fn accept(app: &App, request: &Value, key: Option<String>) -> Result<Accepted, Problem> {
-    let spec = read(request)?;
+    let spec = read(app, request)?;
     // the keys of a JSON value are sorted, so that spaces and order do not make another request
     let fingerprint = BlobId::of(request.to_string().as_bytes()).hex();
     let key = key.map(|key| IdempotencyKey { key, fingerprint });
@@ -128,14 +129,30 @@ pub(crate) async fn accept(app: &App, request: &Value, key: Option<String>) -> R
 }
 
 /// Reads a request for a job; what it names is not looked up yet.
-fn read(request: &Value) -> Result<JobSpec, Problem> {
+fn read(app: &App, request: &Value) -> Result<JobSpec, Problem> {
     let spec = JobSpec::from_value(request).map_err(|faults| Problem::invalid_request("", &faults))?;
     if spec.work.kind() == JobKind::Sensitivity {
         let detail = "a sensitivity is asked for by POST /v1/jobs/{id}/sensitivity".to_owned();
         let fault = Fault { pointer: "/kind".to_owned(), code: "not_offered", detail };
         return Err(Problem::invalid_request("", &[fault]));
     }
+    if let Some(webhook) = &spec.webhook {
+        check_webhook(app.webhooks.as_ref(), &webhook.url)?;
+    }
     Ok(spec)
+}
+
+/// Checks who is to be told of the end. What a name leads to is looked at when the notice is sent.
+fn check_webhook(rules: Option<&Rules>, url: &str) -> Result<(), Problem> {
+    let Some(rules) = rules else {
+        let detail = "this service sends no notices: it has no secret to sign them with".to_owned();
+        let fault = Fault { pointer: "/webhook".to_owned(), code: "not_offered", detail };
+        return Err(Problem::invalid_request("", &[fault]));
+    };
+    rules.read(url).map(|_| ()).map_err(|refused| {
+        let fault = Fault { pointer: "/webhook/url".to_owned(), code: refused.code, detail: refused.detail };
+        Problem::invalid_request("", &[fault])
+    })
 }
 
 /// Looks up everything that a request names, and completes it. Tells the field's dimension, too.
@@ -521,6 +538,9 @@ pub struct FitRequest {
     /// Names to find the job by: at most 16.
     #[schema(required = false)]
     labels: std::collections::BTreeMap<String, String>,
+    /// Who is told of the end.
+    #[schema(required = false)]
+    webhook: Option<WebhookSpec>,
 }
 
 /// A request for a surface: only the field is required. [`JobSpec`] is the same with every default filled in.
@@ -554,4 +574,7 @@ pub struct ShrinkRequest {
     /// Names to find the job by: at most 16.
     #[schema(required = false)]
     labels: std::collections::BTreeMap<String, String>,
+    /// Who is told of the end.
+    #[schema(required = false)]
+    webhook: Option<WebhookSpec>,
 }

@@ -181,6 +181,16 @@ pub struct JobSpec {
     pub outputs: Vec<OutputName>,
     /// Names the client gives the job; jobs can be listed by them.
     pub labels: BTreeMap<String, String>,
+    /// Who is told of the end.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub webhook: Option<WebhookSpec>,
+}
+
+/// Who is told of the end of a job.
+#[derive(Clone, Debug, PartialEq, Serialize, utoipa::ToSchema)]
+pub struct WebhookSpec {
+    /// Where the notice is posted: an `https` address of the public internet, unless the service lets others through.
+    pub url: String,
 }
 
 /// What a job does, by its kind.

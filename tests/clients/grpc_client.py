@@ -9,6 +9,7 @@ import pathlib
 import subprocess
 import sys
 import tempfile
+import threading
 import urllib.request
 
 import grpc
@@ -42,6 +43,8 @@ def serve(program, folder):
     for line in process.stderr:
         entry = json.loads(line)
         if entry.get("message") == "listening":
+            # nobody reads on, and a full pipe must not stop the service
+            threading.Thread(target=process.stderr.read, daemon=True).start()
             return process, entry["http.address"]
     raise SystemExit("the service did not start")
 

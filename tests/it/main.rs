@@ -23,4 +23,5 @@ mod s3;
 mod sensitivity;
 mod walk;
 mod warm;
+mod webhooks;
 mod weight;

@@ -4,7 +4,7 @@ use crate::engine::EngineError;
 use rusqlite::Connection;
 
 /// One step per version; `user_version` counts the steps that were taken. A step is never edited once released.
-const MIGRATIONS: [&str; 3] = [
+const MIGRATIONS: [&str; 4] = [
     "
     CREATE TABLE jobs (
         id          TEXT PRIMARY KEY,
@@ -66,6 +66,15 @@ const MIGRATIONS: [&str; 3] = [
     INSERT INTO outputs (job, name, sha256)
         SELECT jobs.id, 'input:' || member.fullkey, substr(member.value, 8) FROM jobs, json_tree(jobs.spec) AS member
         WHERE member.type = 'text' AND length(member.value) = 71 AND substr(member.value, 1, 7) = 'sha256:';
+",
+    "
+    CREATE TABLE notices (
+        job      TEXT PRIMARY KEY REFERENCES jobs (id) ON DELETE CASCADE,
+        url      TEXT NOT NULL,
+        attempts INTEGER NOT NULL,
+        due_at   INTEGER NOT NULL
+    ) STRICT, WITHOUT ROWID;
+    CREATE INDEX notices_by_time ON notices (due_at);
 ",
 ];
 

@@ -77,7 +77,7 @@ pub async fn differentiate(
     let mut sensing = sensing(&app, &job).await?;
     sensing.gradient = app.blobs.put(bytes).await?;
     let outputs = OutputName::of(JobKind::Sensitivity).to_vec();
-    let spec = JobSpec { work: Work::Sensitivity(Box::new(sensing)), outputs, labels: BTreeMap::new() };
+    let spec = JobSpec { work: Work::Sensitivity(Box::new(sensing)), outputs, labels: BTreeMap::new(), webhook: None };
     let submitted = app.engine.submit(NewJob { id: JobId::new(), spec, key }).await?;
     drop(promise);
     answer_submit(&app, &headers, accepted(submitted)?).await
