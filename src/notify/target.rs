@@ -27,7 +27,9 @@ pub struct Rules {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{detail}")]
 pub struct Refused {
+    /// What is wrong, as a name.
     pub code: &'static str,
+    /// What is wrong, for a person.
     pub detail: String,
 }
 
