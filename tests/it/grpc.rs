@@ -169,7 +169,7 @@ async fn a_request_may_be_text_and_is_judged_without_being_submitted() {
     let mut client = connect(&app).await;
     // deeper than messages go
     let mut scene = json!({"sphere": {"radius": 0.3}});
-    for _ in 0..40 {
+    for _ in 0..35 {
         scene = json!({"translate": {"by": [0.001, 0, 0], "of": scene}});
     }
     let deep = json!({"field": {"scene": scene}}).to_string();
@@ -338,7 +338,7 @@ async fn a_file_is_uploaded_in_pieces_and_named_as_over_http() {
     let over_http: Value = over_http.json().await.expect("JSON");
     assert_eq!(over_http["id"], input.id);
     assert_eq!(Some(object(&over_http["description"])), input.description);
-    let spec = json!({"field": {"input": input.id}, "shrink": {"lattice": {"octahedral": {"n": 12}}}});
+    let spec = json!({"field": {"input": input.id}, "shrink": small()["shrink"]});
     let job = submit(&mut client, &spec).await;
     let events = watch(&mut client, &job.id, None).await;
     assert_eq!(text(events.last().and_then(|e| e.data.as_ref()).expect("a job"), "state"), "succeeded");
