@@ -4,8 +4,10 @@
 //! environment. The defaults need nothing: one folder, loopback only.
 
 use crate::engine::nats::{Address, InvalidAddress};
+use crate::notify::signature::Secret;
 use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
+use ipnet::IpNet;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use std::net::SocketAddr;
@@ -43,6 +45,8 @@ pub struct Config {
     pub retention: Retention,
     /// The worker.
     pub worker: WorkerConfig,
+    /// Notices of the ends of jobs.
+    pub webhooks: WebhooksConfig,
     /// The log.
     pub log: LogConfig,
     /// Traces.
@@ -168,6 +172,23 @@ pub struct WorkerConfig {
     pub max_losses: u32,
 }
 
+/// Notices of the ends of jobs, which jobs ask for (`webhook`).
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WebhooksConfig {
+    /// What notices are signed with (`SHRINKD_WEBHOOKS__SECRETS`, a list): `whsec_` and 24 to 64 bytes in base64; several while one
+    /// takes the place of another. None: no job may ask for a notice.
+    pub secrets: Vec<Secret>,
+    /// Whether notices may go over `http` (`SHRINKD_WEBHOOKS__ALLOW_HTTP`).
+    pub allow_http: bool,
+    /// The ports they may go to (`SHRINKD_WEBHOOKS__PORTS`, a list): 443. None means any.
+    pub ports: Vec<u16>,
+    /// Networks they may go to although they are no part of the public internet (`SHRINKD_WEBHOOKS__ALLOW_PRIVATE`, a list).
+    pub allow_private: Vec<IpNet>,
+    /// What their links to jobs begin with (`SHRINKD_WEBHOOKS__BASE_URL`): where clients reach this service.
+    pub base_url: String,
+}
+
 /// The log, on standard error.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -213,6 +234,7 @@ impl Default for Config {
             retention: Retention { outputs_s: 0, inputs_s: 7 * 24 * 3600, every_s: 3600 },
             limits: Limits { body_bytes: 1 << 20, input_bytes: 256 << 20 },
             worker: WorkerConfig { slots: 2, threads: 0, lease_s: 30, max_losses: 5 },
+            webhooks: WebhooksConfig { ports: vec![443], ..WebhooksConfig::default() },
             log: LogConfig { format: LogFormat::Pretty, filter: "info".to_owned() },
             traces: TracesConfig { endpoint: String::new(), sample_ratio: 1.0 },
         }

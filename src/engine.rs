@@ -6,7 +6,8 @@
 //! Every job belongs to a [`Tenant`]. Whoever asks about a job says for whom, and another tenant's job is not there: it is looked
 //! for where it is not, so that neither the answer nor its time differs from that of a job which never was.
 //! Not guaranteed: that a job runs only once (a worker that is lost in the middle is followed by another attempt), and that
-//! old events are kept (a reader that comes too late gets a fresh snapshot).
+//! old events are kept (a reader that comes too late gets a fresh snapshot). Whoever is to be told of an end is owed that from the
+//! moment of the end, and until somebody settles it.
 
 pub mod conformance;
 pub mod nats;
@@ -140,6 +141,19 @@ pub struct Update {
     pub progress: Option<ProgressView>,
 }
 
+/// The end of a job that somebody is to be told.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DueNotice {
+    /// Whose job it is.
+    pub tenant: Tenant,
+    /// The job, which has ended.
+    pub job: Job,
+    /// Who is to be told.
+    pub url: String,
+    /// Attempts to tell it, this one included.
+    pub attempts: u32,
+}
+
 /// What a renewal found.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Renewal {
@@ -267,6 +281,18 @@ pub trait Engine: Send + Sync {
     fn changes(&self, tenant: &Tenant, id: JobId) -> Changes;
     /// How much there is to do, as this node sees it.
     async fn depth(&self) -> Result<Depth, EngineError>;
+    /// Takes up to `limit` ends of jobs that somebody is to be told, the one that waits longest first. Each is whose took it for
+    /// the time of `hold`, and then due again unless it was settled. It became due in the same step in which its job ended.
+    async fn take_notices(&self, limit: usize, hold: Duration) -> Result<Vec<DueNotice>, EngineError>;
+    /// Notes what became of an attempt: the end is told again at `next`, or not any more. Nothing is noted of an attempt that was
+    /// followed by another.
+    async fn settle_notice(
+        &self,
+        tenant: &Tenant,
+        id: JobId,
+        attempts: u32,
+        next: Option<Timestamp>,
+    ) -> Result<(), EngineError>;
     /// Whether the engine can do its work.
     async fn health(&self) -> Result<(), EngineError>;
 }

@@ -26,6 +26,7 @@ use crate::auth::Authenticator;
 use crate::blobs::Blobs;
 use crate::config::{Limits, Retention};
 use crate::engine::Engine;
+use crate::notify::target::Rules;
 use crate::telemetry::metrics::Exposition;
 use axum::http::HeaderValue;
 use axum::middleware;
@@ -54,6 +55,8 @@ pub struct App {
     pub metrics: Exposition,
     /// Whether that is served at an address of its own.
     pub metrics_apart: bool,
+    /// Who may be told of the ends of jobs; none where nobody is.
+    pub webhooks: Option<Rules>,
     /// Raised when the service stops.
     pub stop: CancellationToken,
 }
@@ -85,8 +88,8 @@ pub fn document() -> utoipa::openapi::OpenApi {
     openapi::complete(api().into_openapi())
 }
 
-/// What a node that only runs jobs answers: whether it lives and is ready, and what is measured.
-pub fn health_router(app: App) -> axum::Router {
+/// What a node that only runs jobs answers: whether it lives and is ready, and what is measured. `others` are routes that get the same around them.
+pub fn health_router(app: App, others: axum::Router) -> axum::Router {
     let (router, _) = OpenApiRouter::<App>::default()
         .routes(routes!(health::livez))
         .routes(routes!(health::readyz))
@@ -94,17 +97,23 @@ pub fn health_router(app: App) -> axum::Router {
         .split_for_parts();
     let router = router.fallback(problem::unknown_route).method_not_allowed_fallback(problem::wrong_method);
     // it has nothing of any tenant
-    let router = router.with_state(app).layer(middleware::from_fn_with_state(None, caller::identify));
+    let router = router.with_state(app).merge(others).layer(middleware::from_fn_with_state(None, caller::identify));
     router.layer(middleware::from_fn(context::request))
 }
 
-/// The service, for those whom the authenticator knows, or for everybody where there is none. Browsers of other origins are let in only when `cors_origins` names them.
-pub fn router(app: App, authenticator: Option<Arc<Authenticator>>, cors_origins: &[String]) -> axum::Router {
+/// The service, for those whom the authenticator knows, or for everybody where there is none. Browsers of other origins are let in only when `cors_origins` names them. `others` are routes that get the same around them.
+pub fn router(
+    app: App,
+    authenticator: Option<Arc<Authenticator>>,
+    cors_origins: &[String],
+    others: axum::Router,
+) -> axum::Router {
     let (router, _) = api().split_for_parts();
     let mut router = router
         .fallback(problem::unknown_route)
         .method_not_allowed_fallback(problem::wrong_method)
         .with_state(app)
+        .merge(others)
         .layer(CatchPanicLayer::custom(problem::panicked))
         .layer(middleware::from_fn_with_state(authenticator, caller::identify));
     if !cors_origins.is_empty() {

@@ -7,9 +7,12 @@ use crate::auth::issuer::Issuer;
 use crate::auth::keys::KeyRing;
 use crate::blobs::Blobs;
 use crate::config::{AuthMode, Config, FOLDER, Role, SQLITE};
+use crate::grpc;
 use crate::http::{self, App};
 use crate::job::worker::Worker;
 use crate::job::{collector, priority};
+use crate::notify::courier::{Courier, SystemNames};
+use crate::notify::target::Rules;
 use crate::telemetry;
 use crate::telemetry::metrics::{self, Exposition};
 use crate::telemetry::traces::Traces;
@@ -152,6 +155,12 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
     };
     let worker = (config.role != Role::Api).then(|| tokio::spawn(worker().run(stop.clone())));
     tokio::spawn(collector::run(engine.clone(), blobs.clone(), config.retention, stop.clone()));
+    let courier = if config.role == Role::Worker || config.webhooks.secrets.is_empty() {
+        None
+    } else {
+        let courier = Courier::new(&config.webhooks, Arc::new(SystemNames))?;
+        Some(tokio::spawn(courier.run(engine.clone(), stop.clone())))
+    };
     let app = App {
         engine,
         blobs,
@@ -160,6 +169,7 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
         download_link: Duration::from_secs(config.download_link_s),
         metrics: exposition,
         metrics_apart: config.metrics_listen.is_some(),
+        webhooks: (!config.webhooks.secrets.is_empty()).then(|| Rules::from(&config.webhooks)),
         stop: stop.clone(),
     };
     if let Some(address) = config.metrics_listen {
@@ -168,9 +178,10 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
         tokio::spawn(axum::serve(listener, router).into_future());
     }
     let router = match config.role {
-        Role::Worker => http::health_router(app),
-        Role::All | Role::Api => http::router(app, authenticator, &config.cors_origins),
+        Role::Worker => http::health_router(app.clone(), grpc::health_routes(app)),
+        Role::All | Role::Api => http::router(app.clone(), authenticator, &config.cors_origins, grpc::routes(app)),
     };
+    let router = router.layer(axum::middleware::from_fn(grpc::speak));
     let routes = router.clone();
     let graceful = axum::serve(listener, router).with_graceful_shutdown(stop.clone().cancelled_owned());
     let server = tokio::spawn(graceful.into_future());
@@ -188,6 +199,9 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
     let drained = async {
         if let Some(worker) = worker {
             worker.await?;
+        }
+        if let Some(courier) = courier {
+            courier.await?;
         }
         server.await??;
         Ok::<_, Box<dyn std::error::Error>>(())

@@ -8,8 +8,8 @@
 //! ```
 
 use super::{
-    Claim, Depth, Engine, EngineError, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Renewal, Submitted,
-    Update, follow,
+    Claim, Depth, DueNotice, Engine, EngineError, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Renewal,
+    Submitted, Update, follow,
 };
 use crate::blobs::BlobId;
 use crate::job::spec::{WarmStartSpec, Work};
@@ -66,6 +66,7 @@ pub async fn run(engine: Arc<dyn Engine>) {
     another_tenants_job_is_not_there(&engine).await;
     keys_and_labels_are_each_tenants_own(&engine).await;
     what_there_is_to_do_is_counted(&engine).await;
+    an_end_is_told_until_that_is_settled(&engine).await;
     engine.health().await.expect("healthy");
 }
 
@@ -278,6 +279,79 @@ async fn a_blob_is_named_while_a_job_remembers_it(engine: &Arc<dyn Engine>) {
     assert_eq!(unnamed(Some(later)).await, [input.hex(), output.clone(), stray.clone()]);
     assert_eq!(engine.forget(&own(), id).await.expect("answers"), Forgotten::Gone(vec![output.clone()]), "inputs stay");
     assert_eq!(unnamed(None).await, [input.hex(), output.clone(), stray.clone()]);
+}
+
+/// Takes notices until there are some.
+async fn notices(engine: &Arc<dyn Engine>, hold: Duration) -> Vec<DueNotice> {
+    let deadline = tokio::time::Instant::now() + PATIENCE;
+    loop {
+        let taken = engine.take_notices(8, hold).await.expect("takes");
+        if !taken.is_empty() {
+            return taken;
+        }
+        assert!(tokio::time::Instant::now() < deadline, "nothing is due");
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}
+
+async fn an_end_is_told_until_that_is_settled(engine: &Arc<dyn Engine>) {
+    const LONG: Duration = Duration::from_secs(3600);
+    let url = "https://example.com/in";
+    let webhook = json!({"field": {"scene": {"sphere": {"radius": 0.5}}}, "webhook": {"url": url}});
+    let told = || {
+        let spec =
+            JobSpec::from_value(&webhook).unwrap_or_else(|faults| panic!("the suite's own job is refused: {faults:?}"));
+        NewJob { spec, ..new_job() }
+    };
+    let none = async || engine.take_notices(8, LONG).await.expect("takes").is_empty();
+    let id = submit(engine, told()).await;
+    assert!(none().await, "nothing is told before the end");
+    let claim = claim_one(engine, "a").await;
+    engine.finish(&claim, success("aa")).await.expect("finishes");
+    let ended = engine.get(&own(), id).await.expect("reads").expect("is there");
+    let first = notices(engine, Duration::from_millis(100)).await;
+    assert_eq!(first, [DueNotice { tenant: own(), job: ended.clone(), url: url.to_owned(), attempts: 1 }]);
+    // whoever took it is gone: it is due again, and what the first one says later counts no more
+    let second = notices(engine, LONG).await;
+    assert_eq!((second.len(), second[0].attempts), (1, 2));
+    engine.settle_notice(&own(), id, 1, None).await.expect("settles");
+    assert!(none().await, "it is held");
+    let soon = Timestamp::now().checked_add(jiff::SignedDuration::from_millis(50)).expect("a time");
+    engine.settle_notice(&own(), id, 2, Some(soon)).await.expect("settles");
+    let third = notices(engine, LONG).await;
+    assert_eq!((third.len(), third[0].attempts), (1, 3));
+    engine.settle_notice(&own(), id, 3, None).await.expect("settles");
+    engine.settle_notice(&own(), id, 3, Some(soon)).await.expect("settles");
+    tokio::time::sleep(Duration::from_millis(100)).await;
+    assert!(none().await, "it is over");
+    assert_eq!(
+        engine.get(&own(), id).await.expect("reads"),
+        Some(ended),
+        "telling an end changes nothing about the job"
+    );
+
+    // one that is canceled while it waits is told, too, and whoever asks at once does not get it twice
+    let canceled = submit(engine, told()).await;
+    engine.request_cancel(&own(), canceled).await.expect("cancels");
+    let mut asking = Vec::new();
+    for _ in 0..8 {
+        let engine = engine.clone();
+        asking.push(tokio::spawn(async move { engine.take_notices(8, LONG).await.expect("takes") }));
+    }
+    let mut got = Vec::new();
+    for asked in asking {
+        got.extend(asked.await.expect("no panic"));
+    }
+    if got.is_empty() {
+        got = notices(engine, LONG).await;
+    }
+    assert_eq!(
+        got.iter().map(|notice| (notice.job.id, notice.job.state)).collect::<Vec<_>>(),
+        [(canceled, State::Canceled)]
+    );
+    engine.settle_notice(&own(), canceled, 1, Some(Timestamp::now())).await.expect("settles");
+    engine.forget(&own(), canceled).await.expect("forgets");
+    assert!(none().await, "nobody is told of a job that was forgotten");
 }
 
 async fn collect(engine: &Arc<dyn Engine>, id: JobId, after: Option<u64>) -> Vec<Event> {

@@ -12,6 +12,7 @@
 //! | lost workers are found | every node watches heartbeats by its own clock (`leases`) |
 //! | events have no gap | they are stored with the record, in one message (`record`) |
 //! | one key, one job | a key names its job, and whoever finds it makes that job (`keys`) |
+//! | an end is told | what is owed is stored with the end, in its record (`notices`) |
 //!
 //! Not guaranteed beyond what the [room](super) says: a list on one node shows what was submitted on another only once its
 //! feed has brought it, usually within milliseconds; and a job that comes back to the queue waits behind those that are there.
@@ -27,6 +28,7 @@ mod layout;
 mod leases;
 mod ledger;
 mod link;
+mod notices;
 mod projection;
 mod queue;
 mod record;
@@ -38,8 +40,8 @@ pub use address::{Address, InvalidAddress, SCHEMES};
 pub use api_keys::NatsKeys;
 
 use super::{
-    Changes, Claim, Depth, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Page,
-    Renewal, Submitted, Terms, Update,
+    Changes, Claim, Depth, DueNotice, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob,
+    Outcome, Page, Renewal, Submitted, Terms, Update,
 };
 use crate::job::{Job, JobId, JobSpec, State};
 use crate::tenant::Tenant;
@@ -378,6 +380,23 @@ impl Engine for NatsEngine {
         limit: usize,
     ) -> Result<Option<EventPage>, EngineError> {
         patiently(self.node.events_after(&Name::new(tenant, id), after, limit)).await
+    }
+
+    async fn take_notices(&self, limit: usize, hold: Duration) -> Result<Vec<DueNotice>, EngineError> {
+        if limit == 0 {
+            return Ok(Vec::new());
+        }
+        patiently(notices::take(&self.node.ledger, limit, hold)).await
+    }
+
+    async fn settle_notice(
+        &self,
+        tenant: &Tenant,
+        id: JobId,
+        attempts: u32,
+        next: Option<Timestamp>,
+    ) -> Result<(), EngineError> {
+        patiently(notices::settle(&self.node.ledger, &Name::new(tenant, id), attempts, next)).await
     }
 
     fn changes(&self, tenant: &Tenant, id: JobId) -> Changes {

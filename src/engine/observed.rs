@@ -2,8 +2,8 @@
 //! [`Engine::interrupted`]) are passed on as they are.
 
 use super::{
-    Changes, Claim, Depth, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Page,
-    Renewal, Submitted, Update,
+    Changes, Claim, Depth, DueNotice, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob,
+    Outcome, Page, Renewal, Submitted, Update,
 };
 use crate::job::{Job, JobId, JobSpec};
 use crate::telemetry::{metrics, traces};
@@ -82,6 +82,18 @@ impl Engine for Observed {
     }
     fn changes(&self, tenant: &Tenant, id: JobId) -> Changes {
         self.0.changes(tenant, id)
+    }
+    async fn take_notices(&self, limit: usize, hold: Duration) -> Result<Vec<DueNotice>, EngineError> {
+        timed("take_notices", self.0.take_notices(limit, hold)).await
+    }
+    async fn settle_notice(
+        &self,
+        tenant: &Tenant,
+        id: JobId,
+        attempts: u32,
+        next: Option<Timestamp>,
+    ) -> Result<(), EngineError> {
+        timed("settle_notice", self.0.settle_notice(tenant, id, attempts, next)).await
     }
     async fn depth(&self) -> Result<Depth, EngineError> {
         timed("depth", self.0.depth()).await

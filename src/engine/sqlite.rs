@@ -4,6 +4,7 @@
 //! begins is committed together, so that many submits share one sync. Readers have connections of their own and never
 //! wait for the writer. A lock file keeps a second process out, so every claim found at the start belongs to a dead worker.
 
+pub(super) mod notices;
 mod readers;
 pub(super) mod records;
 pub(super) mod schema;
@@ -12,8 +13,8 @@ pub(super) mod writer;
 pub(super) use readers::Readers;
 
 use super::{
-    Changes, Claim, Depth, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Page,
-    Renewal, Submitted, Terms, Update,
+    Changes, Claim, Depth, DueNotice, Engine, EngineError, EventPage, Forgotten, IdempotencyKey, ListQuery, NewJob,
+    Outcome, Page, Renewal, Submitted, Terms, Update,
 };
 use crate::job::{Failure, Job, JobId, JobSpec, State};
 use crate::telemetry::metrics;
@@ -276,6 +277,26 @@ impl Engine for SqliteEngine {
     async fn depth(&self) -> Result<Depth, EngineError> {
         let (open, oldest_queued) = self.read(records::depth).await?;
         Ok(Depth { open, oldest_queued, connected: true, lag: 0 })
+    }
+
+    async fn take_notices(&self, limit: usize, hold: Duration) -> Result<Vec<DueNotice>, EngineError> {
+        // most looks find nothing, and cost no commit
+        let now = Timestamp::now().as_millisecond();
+        if limit == 0 || self.read(move |c| notices::due(c, now, 1)).await?.is_empty() {
+            return Ok(Vec::new());
+        }
+        self.write(move |ctx| notices::take(ctx, limit, hold)).await
+    }
+
+    async fn settle_notice(
+        &self,
+        _: &Tenant,
+        id: JobId,
+        attempts: u32,
+        next: Option<Timestamp>,
+    ) -> Result<(), EngineError> {
+        let next = next.map(Timestamp::as_millisecond);
+        self.write(move |ctx| notices::settle(ctx, id, attempts, next)).await
     }
 
     async fn health(&self) -> Result<(), EngineError> {

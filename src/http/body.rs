@@ -40,7 +40,7 @@ pub async fn read(body: Body, limit: u64) -> Result<Bytes, Problem> {
 /// Reads a JSON body of at most `limit` bytes.
 ///
 /// # Errors
-/// 415 for another media type, 413 when it is too large, 400 when it is no JSON or nested too deeply.
+/// 415 for another media type, 413 when it is too large, and those of [`parse_json`].
 pub async fn read_json(headers: &HeaderMap, body: Body, limit: u64) -> Result<Value, Problem> {
     let media_type = headers.get(header::CONTENT_TYPE).and_then(|v| v.to_str().ok()).unwrap_or("");
     let essence = media_type.split(';').next().unwrap_or("").trim().to_ascii_lowercase();
@@ -49,8 +49,15 @@ pub async fn read_json(headers: &HeaderMap, body: Body, limit: u64) -> Result<Va
         let title = "the body has another media type";
         return Err(Problem::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "unsupported_media_type", title, detail));
     }
-    let bytes = read(body, limit).await?;
-    serde_json::from_slice(&bytes).map_err(|error| {
+    parse_json(&read(body, limit).await?)
+}
+
+/// Parses JSON.
+///
+/// # Errors
+/// 400 when it is none or nested too deeply.
+pub fn parse_json(bytes: &[u8]) -> Result<Value, Problem> {
+    serde_json::from_slice(bytes).map_err(|error| {
         // the parser stops at 128 levels and says so only in its message
         if error.to_string().contains("recursion limit") {
             let detail = format!("values may be nested 127 deep; line {}, column {}", error.line(), error.column());

@@ -17,7 +17,8 @@ use axum::response::{IntoResponse, Response};
 use std::sync::Arc;
 
 /// Routes for which it does not matter who asks.
-pub(super) const OPEN: [&str; 3] = ["/livez", "/readyz", "/openapi.json"];
+pub(super) const OPEN: [&str; 5] =
+    ["/livez", "/readyz", "/openapi.json", "/grpc.health.v1.Health/Check", "/grpc.health.v1.Health/Watch"];
 
 impl<S: Sync> FromRequestParts<S> for Caller {
     type Rejection = Problem;

@@ -33,6 +33,15 @@ pub async fn livez() -> Json<Health> {
     )
 )]
 pub async fn readyz(State(app): State<App>) -> Result<Json<Health>, Problem> {
+    ready(&app).await?;
+    Ok(Json(OK))
+}
+
+/// Whether requests can be served.
+///
+/// # Errors
+/// 503 that says why they cannot.
+pub async fn ready(app: &App) -> Result<(), Problem> {
     if app.stop.is_cancelled() {
         return Err(Problem::unavailable("stopping", "the service is stopping"));
     }
@@ -44,5 +53,5 @@ pub async fn readyz(State(app): State<App>) -> Result<Json<Health>, Problem> {
         tracing::error!(%error, "the blob store is out of reach");
         return Err(Problem::unavailable("blobs_unavailable", "the blob store is out of reach"));
     }
-    Ok(Json(OK))
+    Ok(())
 }

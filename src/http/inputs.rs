@@ -27,18 +27,18 @@ const READING: [&str; 5] = ["family", "encoding", "activation", "w0", "skip"];
 pub struct Input {
     /// Its name: `sha256:` and the hash of its bytes.
     #[schema(value_type = String)]
-    id: BlobId,
+    pub(crate) id: BlobId,
     /// Its size.
-    bytes: u64,
+    pub(crate) bytes: u64,
     /// When its tenant first uploaded it.
     #[schema(value_type = String, format = DateTime)]
-    created_at: Timestamp,
+    pub(crate) created_at: Timestamp,
     /// What the upload said of how to read it.
     #[serde(default, skip_serializing_if = "says_nothing")]
     #[schema(required = false)]
     options: FieldOptions,
     /// What it is: its kind, and what was found in it.
-    description: Description,
+    pub(crate) description: Description,
 }
 
 impl Input {
@@ -106,15 +106,35 @@ pub async fn upload(
     let tenant = caller.may(Scope::Write)?;
     let options = reading_options(raw.as_deref())?;
     let bytes = body::read(body, app.limits.input_bytes).await?;
+    match store(&app, tenant, bytes, options).await? {
+        Stored::Known(input) => Ok((StatusCode::OK, Json(input)).into_response()),
+        Stored::New(input) => {
+            let location =
+                HeaderValue::from_str(&format!("/v1/inputs/{}", input.id)).map_err(|_| Problem::internal())?;
+            Ok((StatusCode::CREATED, [(header::LOCATION, location)], Json(input)).into_response())
+        }
+    }
+}
+
+/// What became of an upload.
+pub(crate) enum Stored {
+    /// It was there already.
+    Known(Input),
+    /// It is there now.
+    New(Input),
+}
+
+/// Checks a file and stores it, with what it is when it is read as `options` say.
+pub(crate) async fn store(app: &App, tenant: &Tenant, bytes: Bytes, options: FieldOptions) -> Result<Stored, Problem> {
     metrics::uploaded(bytes.len() as u64);
     let hashed = bytes.clone();
     let id = tokio::task::spawn_blocking(move || BlobId::of(&hashed)).await.map_err(joined)?;
-    if let Some(mut known) = known(&app, tenant, id).await? {
+    if let Some(mut known) = known(app, tenant, id).await? {
         // the note keeps what the first upload said: an answer depends on its own request alone
         if known.options != options {
             known = Input { description: described(bytes, options.clone()).await?, options, ..known };
         }
-        return Ok((StatusCode::OK, Json(known)).into_response());
+        return Ok(Stored::Known(known));
     }
     let description = described(bytes.clone(), options.clone()).await?;
     let input = Input { id, bytes: bytes.len() as u64, created_at: Timestamp::now(), options, description };
@@ -123,8 +143,7 @@ pub async fn upload(
     // the note comes last: an input that is known is complete
     let note = serde_json::to_vec(&input).map_err(|_| Problem::internal())?;
     app.blobs.put_note(tenant, id, note.into()).await?;
-    let location = HeaderValue::from_str(&format!("/v1/inputs/{id}")).map_err(|_| Problem::internal())?;
-    Ok((StatusCode::CREATED, [(header::LOCATION, location)], Json(input)).into_response())
+    Ok(Stored::New(input))
 }
 
 /// The input, if it is there already; from now on it is kept as one that was just uploaded.

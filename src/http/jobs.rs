@@ -9,8 +9,9 @@ use crate::auth::{Caller, Scope};
 use crate::blobs::BlobId;
 use crate::engine::{Forgotten, IdempotencyKey, NewJob, Submitted};
 use crate::field::{Fault, FieldError};
-use crate::job::spec::{FieldSpec, Fitting, Work};
+use crate::job::spec::{FieldSpec, Fitting, WebhookSpec, Work};
 use crate::job::{Failure, Job, JobId, JobKind, JobSpec, OutputName, pipeline};
+use crate::notify::target::Rules;
 use crate::shrink::Method;
 use crate::telemetry::metrics;
 use crate::tenant::Tenant;
@@ -20,10 +21,11 @@ use axum::extract::{Path, RawQuery, State};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
+use serde_json::Value;
 use std::time::{Duration, Instant};
 
 /// Characters of an idempotency key.
-const MAX_KEY: usize = 255;
+pub(crate) const MAX_KEY: usize = 255;
 /// Longest hint to come back, seconds: an estimate far ahead is not worth more trust.
 const MAX_RETRY_AFTER: f64 = 30.0;
 /// Evaluations per vertex of the adaptive method, the median over the table of `benches/extract_table.py`.
@@ -41,9 +43,9 @@ pub struct Estimate {
     /// Whether the request would be accepted; always true here, a faulty one is a 422.
     valid: bool,
     /// Vertices of the result.
-    vertices: u64,
+    pub(crate) vertices: u64,
     /// Field evaluations, estimated.
-    evaluations: u64,
+    pub(crate) evaluations: u64,
 }
 
 /// Submits a job
@@ -82,43 +84,61 @@ pub async fn submit(
     body: Body,
 ) -> Result<Response, Problem> {
     let tenant = caller.may(Scope::Write)?;
-    let clock = Instant::now();
     let parameters = query::parameters(raw.as_deref(), &["validate_only"], &[])?;
     let validate_only = query::flag(&parameters, "validate_only")?;
     let key = idempotency_key(&headers)?;
     let request = body::read_json(&headers, body, app.limits.body_bytes).await?;
+    if validate_only {
+        return Ok(Json(judge(&app, tenant, &request).await?).into_response());
+    }
+    let accepted = accept(&app, tenant, &request, key).await?;
+    answer_submit(&app, tenant, &headers, accepted).await
+}
+
+/// A job that was accepted, now or by an earlier request with the same key.
+pub(crate) struct Accepted {
+    /// The job as it was accepted.
+    pub job: Job,
+    /// Whether an earlier request did.
+    pub replayed: bool,
+}
+
+/// Estimates what a request would cost, checking it as if it were submitted.
+pub(crate) async fn judge(app: &App, tenant: &Tenant, request: &Value) -> Result<Estimate, Problem> {
+    let spec = read(app, request)?;
+    let _promise = app.blobs.promise().await;
+    let (spec, dimension) = look_up(app, tenant, spec, request).await?;
+    Ok(estimate(&spec, dimension))
+}
+
+/// Accepts a request for a job, whatever way it came: the job is durable before this returns.
+pub(crate) async fn accept(
+    app: &App,
+    tenant: &Tenant,
+    request: &Value,
+    key: Option<String>,
+) -> Result<Accepted, Problem> {
+    let clock = Instant::now();
+    let spec = read(app, request)?;
     // the keys of a JSON value are sorted, so that spaces and order do not make another request
     let fingerprint = BlobId::of(request.to_string().as_bytes()).hex();
-    let spec = JobSpec::from_value(&request).map_err(|faults| Problem::invalid_request("", &faults))?;
-    if spec.work.kind() == JobKind::Sensitivity {
-        let detail = "a sensitivity is asked for by POST /v1/jobs/{id}/sensitivity".to_owned();
-        let fault = Fault { pointer: "/kind".to_owned(), code: "not_offered", detail };
-        return Err(Problem::invalid_request("", &[fault]));
-    }
     let key = key.map(|key| IdempotencyKey { key, fingerprint });
     // a repeated request has its answer, also when what it named is gone by now
-    if let Some(key) = key.as_ref().filter(|_| !validate_only)
+    if let Some(key) = &key
         && let Some(answer) = app.engine.recall(tenant, key.clone()).await?
     {
-        return answer_submit(&app, tenant, &headers, answer).await;
+        return accepted(answer);
     }
     // no blob goes from the moment that it is looked up until the new job's record names it
     let promise = app.blobs.promise().await;
-    let dimension = check_fields(&app, tenant, &spec).await?;
-    let mut spec = spec.for_dimension(dimension, &request).map_err(|faults| Problem::invalid_request("", &faults))?;
-    if matches!(&spec.work, Work::Shrink(work) if work.warm_start.is_some()) {
-        warm_start::resolve(&app, tenant, &mut spec).await?;
-    }
-    if validate_only {
-        return Ok(Json(estimate(&spec, dimension)).into_response());
-    }
+    let (spec, _) = look_up(app, tenant, spec, request).await?;
     if app.stop.is_cancelled() {
         return Err(Problem::unavailable("stopping", "the service is stopping"));
     }
     let submitted = app.engine.submit(NewJob { tenant: tenant.clone(), id: JobId::new(), spec, key }).await?;
     drop(promise);
     tell_accepted(&submitted, clock);
-    answer_submit(&app, tenant, &headers, submitted).await
+    accepted(submitted)
 }
 
 /// Counts a job that is new.
@@ -128,14 +148,46 @@ fn tell_accepted(submitted: &Submitted, since: Instant) {
     }
 }
 
-/// The answer to a submit, after the wait that `Prefer` asks for.
-async fn answer_submit(
-    app: &App,
-    tenant: &Tenant,
-    headers: &HeaderMap,
-    submitted: Submitted,
-) -> Result<Response, Problem> {
-    let (mut job, replayed) = match submitted {
+/// Reads a request for a job; what it names is not looked up yet.
+fn read(app: &App, request: &Value) -> Result<JobSpec, Problem> {
+    let spec = JobSpec::from_value(request).map_err(|faults| Problem::invalid_request("", &faults))?;
+    if spec.work.kind() == JobKind::Sensitivity {
+        let detail = "a sensitivity is asked for by POST /v1/jobs/{id}/sensitivity".to_owned();
+        let fault = Fault { pointer: "/kind".to_owned(), code: "not_offered", detail };
+        return Err(Problem::invalid_request("", &[fault]));
+    }
+    if let Some(webhook) = &spec.webhook {
+        check_webhook(app.webhooks.as_ref(), &webhook.url)?;
+    }
+    Ok(spec)
+}
+
+/// Checks who is to be told of the end. What a name leads to is looked at when the notice is sent.
+fn check_webhook(rules: Option<&Rules>, url: &str) -> Result<(), Problem> {
+    let Some(rules) = rules else {
+        let detail = "this service sends no notices: it has no secret to sign them with".to_owned();
+        let fault = Fault { pointer: "/webhook".to_owned(), code: "not_offered", detail };
+        return Err(Problem::invalid_request("", &[fault]));
+    };
+    rules.read(url).map(|_| ()).map_err(|refused| {
+        let fault = Fault { pointer: "/webhook/url".to_owned(), code: refused.code, detail: refused.detail };
+        Problem::invalid_request("", &[fault])
+    })
+}
+
+/// Looks up everything that a request names, and completes it. Tells the field's dimension, too.
+async fn look_up(app: &App, tenant: &Tenant, spec: JobSpec, request: &Value) -> Result<(JobSpec, u8), Problem> {
+    let dimension = check_fields(app, tenant, &spec).await?;
+    let mut spec = spec.for_dimension(dimension, request).map_err(|faults| Problem::invalid_request("", &faults))?;
+    if matches!(&spec.work, Work::Shrink(work) if work.warm_start.is_some()) {
+        warm_start::resolve(app, tenant, &mut spec).await?;
+    }
+    Ok((spec, dimension))
+}
+
+/// What the engine made of a submit.
+fn accepted(submitted: Submitted) -> Result<Accepted, Problem> {
+    let (job, replayed) = match submitted {
         Submitted::Created(job) => (job, false),
         Submitted::Replayed(job) => (job, true),
         Submitted::KeyConflict => {
@@ -152,6 +204,17 @@ async fn answer_submit(
         }
     };
     tracing::info!(job.id = %job.id, replayed, "job submitted");
+    Ok(Accepted { job, replayed })
+}
+
+/// The answer to a submit, after the wait that `Prefer` asks for.
+async fn answer_submit(
+    app: &App,
+    tenant: &Tenant,
+    headers: &HeaderMap,
+    accepted: Accepted,
+) -> Result<Response, Problem> {
+    let Accepted { mut job, replayed } = accepted;
     let mut answer = HeaderMap::new();
     let location = HeaderValue::from_str(&format!("/v1/jobs/{}", job.id)).map_err(|_| Problem::internal())?;
     answer.insert(header::LOCATION, location);
@@ -235,12 +298,18 @@ pub async fn cancel(
 ) -> Result<Response, Problem> {
     let tenant = caller.may(Scope::Write)?;
     query::parameters(raw.as_deref(), &[], &[])?;
-    let id = job_id(&id)?;
+    let job = request_cancel(&app, tenant, &id).await?;
+    let status = if job.state.ended() { StatusCode::OK } else { StatusCode::ACCEPTED };
+    Ok((status, job_answer(job)).into_response())
+}
+
+/// Asks for a job to be stopped. The record afterwards.
+pub(crate) async fn request_cancel(app: &App, tenant: &Tenant, id: &str) -> Result<Job, Problem> {
+    let id = job_id(id)?;
     let job = app.engine.request_cancel(tenant, id).await?;
     let job = job.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
     tracing::info!(job.id = %id, job.state = job.state.name(), "cancel requested");
-    let status = if job.state.ended() { StatusCode::OK } else { StatusCode::ACCEPTED };
-    Ok((status, job_answer(job)).into_response())
+    Ok(job)
 }
 
 /// Forgets a job and its outputs
@@ -264,7 +333,13 @@ pub async fn forget(
 ) -> Result<StatusCode, Problem> {
     let tenant = caller.may(Scope::Write)?;
     query::parameters(raw.as_deref(), &[], &[])?;
-    let id = job_id(&id)?;
+    remove(&app, tenant, &id).await?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+/// Forgets an ended job, and the blobs that no other job names.
+pub(crate) async fn remove(app: &App, tenant: &Tenant, id: &str) -> Result<(), Problem> {
+    let id = job_id(id)?;
     // no job may come to name a blob between the two steps
     let _sweep = app.blobs.sweep().await;
     match app.engine.forget(tenant, id).await? {
@@ -274,7 +349,7 @@ pub async fn forget(
             }
             app.blobs.remove_checkpoint(tenant, &id.to_string()).await?;
             tracing::info!(job.id = %id, "job forgotten");
-            Ok(StatusCode::NO_CONTENT)
+            Ok(())
         }
         Forgotten::Running => {
             let detail = "cancel the job first, or wait for its end";
@@ -285,7 +360,7 @@ pub async fn forget(
 }
 
 /// The job of that name; what is no name is a job that is not there.
-pub(super) fn job_id(text: &str) -> Result<JobId, Problem> {
+pub(crate) fn job_id(text: &str) -> Result<JobId, Problem> {
     text.parse().map_err(|_| Problem::unknown_job(text))
 }
 
@@ -331,11 +406,17 @@ async fn wait_until(
 fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, Problem> {
     let mut keys = headers.get_all("idempotency-key").iter();
     let Some(key) = keys.next() else { return Ok(None) };
-    let text = key.to_str().ok().filter(|k| !k.trim().is_empty() && k.len() <= MAX_KEY);
-    match (text, keys.next()) {
-        (Some(text), None) => Ok(Some(text.trim().to_owned())),
+    match (key.to_str().ok().and_then(read_key), keys.next()) {
+        (Some(key), None) => Ok(Some(key)),
         _ => Err(Problem::header(format!("Idempotency-Key: expected one key of 1 to {MAX_KEY} visible characters"))),
     }
+}
+
+/// A key as it is kept; `None` for what is none.
+pub(crate) fn read_key(text: &str) -> Option<String> {
+    let visible = |b: u8| b == b'\t' || (b' '..=b'~').contains(&b);
+    let is_key = !text.trim().is_empty() && text.len() <= MAX_KEY && text.bytes().all(visible);
+    is_key.then(|| text.trim().to_owned())
 }
 
 /// Checks what the field and the weight name. Tells the field's dimension.
@@ -496,6 +577,9 @@ pub struct FitRequest {
     /// Names to find the job by: at most 16.
     #[schema(required = false)]
     labels: std::collections::BTreeMap<String, String>,
+    /// Who is told of the end.
+    #[schema(required = false)]
+    webhook: Option<WebhookSpec>,
 }
 
 /// A request for a surface: only the field is required. [`JobSpec`] is the same with every default filled in.
@@ -529,4 +613,7 @@ pub struct ShrinkRequest {
     /// Names to find the job by: at most 16.
     #[schema(required = false)]
     labels: std::collections::BTreeMap<String, String>,
+    /// Who is told of the end.
+    #[schema(required = false)]
+    webhook: Option<WebhookSpec>,
 }

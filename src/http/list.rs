@@ -4,6 +4,7 @@ use super::{App, Problem, query};
 use crate::auth::{Caller, Scope};
 use crate::engine::ListQuery;
 use crate::job::{Job, JobId, State};
+use crate::tenant::Tenant;
 use axum::Json;
 use axum::extract::{RawQuery, State as Shared};
 use axum::http::{HeaderMap, HeaderValue, header};
@@ -13,7 +14,7 @@ use jiff::Timestamp;
 use serde::Serialize;
 
 /// Jobs of a page when nothing is said.
-const DEFAULT_LIMIT: u64 = 50;
+pub(crate) const DEFAULT_LIMIT: u64 = 50;
 /// Jobs of a page at most.
 const MAX_LIMIT: u64 = 200;
 /// Filters by label at most.
@@ -29,9 +30,9 @@ pub struct LabelFilter(String);
 #[derive(Serialize, utoipa::ToSchema)]
 pub struct JobPage {
     /// The jobs, newest first.
-    jobs: Vec<Job>,
+    pub(crate) jobs: Vec<Job>,
     /// The cursor of the next page; null on the last one.
-    next_cursor: Option<String>,
+    pub(crate) next_cursor: Option<String>,
 }
 
 /// Lists jobs, newest first
@@ -61,9 +62,6 @@ pub async fn list(
     let known = ["state", "label", "created_from", "created_to", "limit", "cursor"];
     let parameters = query::parameters(raw.as_deref(), &known, &["state", "label"])?;
     let limit = query::number(&parameters, "limit")?.unwrap_or(DEFAULT_LIMIT);
-    if !(1..=MAX_LIMIT).contains(&limit) {
-        return Err(Problem::query(format!("limit: expected 1 to {MAX_LIMIT}, found {limit}")));
-    }
     let mut wanted = ListQuery {
         before: query::value(&parameters, "cursor").map(read_cursor).transpose()?,
         created_from: time(&parameters, "created_from")?,
@@ -86,17 +84,26 @@ pub async fn list(
             _ => {}
         }
     }
+    let page = page(&app, tenant, wanted).await?;
+    let mut headers = HeaderMap::from_iter([(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"))]);
+    if let Some(cursor) = &page.next_cursor {
+        let link = next_link(raw.as_deref().unwrap_or(""), cursor);
+        headers.insert(header::LINK, HeaderValue::from_str(&link).map_err(|_| Problem::internal())?);
+    }
+    Ok((headers, Json(page)))
+}
+
+/// A page of jobs, whatever way it was asked for.
+pub(crate) async fn page(app: &App, tenant: &Tenant, wanted: ListQuery) -> Result<JobPage, Problem> {
+    if !(1..=MAX_LIMIT).contains(&(wanted.limit as u64)) {
+        return Err(Problem::query(format!("limit: expected 1 to {MAX_LIMIT}, found {}", wanted.limit)));
+    }
     if wanted.labels.len() > MAX_LABELS {
         return Err(Problem::query(format!("label: at most {MAX_LABELS}")));
     }
     let page = app.engine.list(tenant, wanted).await?;
     let next_cursor = page.jobs.last().filter(|_| page.more).map(|job| BASE64_URL_SAFE_NO_PAD.encode(job.id.0));
-    let mut headers = HeaderMap::from_iter([(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"))]);
-    if let Some(cursor) = &next_cursor {
-        let link = next_link(raw.as_deref().unwrap_or(""), cursor);
-        headers.insert(header::LINK, HeaderValue::from_str(&link).map_err(|_| Problem::internal())?);
-    }
-    Ok((headers, Json(JobPage { jobs: page.jobs, next_cursor })))
+    Ok(JobPage { jobs: page.jobs, next_cursor })
 }
 
 /// The same query with another cursor.
@@ -106,7 +113,7 @@ fn next_link(query: &str, cursor: &str) -> String {
     format!("</v1/jobs?{}>; rel=\"next\"", parameters.join("&"))
 }
 
-fn read_cursor(text: &str) -> Result<JobId, Problem> {
+pub(crate) fn read_cursor(text: &str) -> Result<JobId, Problem> {
     let bytes = BASE64_URL_SAFE_NO_PAD.decode(text).ok();
     let id = bytes.and_then(|b| uuid::Uuid::from_slice(&b).ok());
     id.map(JobId).ok_or_else(|| Problem::query("cursor: not a cursor that was given out"))

@@ -4,12 +4,14 @@ mod links;
 mod scene;
 
 use super::problem::ProblemDocument;
+use crate::notify::payload::Notice;
 use axum::Json;
 use utoipa::openapi::content::ContentBuilder;
-use utoipa::openapi::path::{Operation, Parameter};
-use utoipa::openapi::schema::{Array, Object, SchemaType, Type};
+use utoipa::openapi::path::{HttpMethod, Operation, OperationBuilder, Parameter, ParameterBuilder, ParameterIn};
+use utoipa::openapi::request_body::RequestBodyBuilder;
+use utoipa::openapi::schema::{Array, Object, ObjectBuilder, SchemaType, Type};
 use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityRequirement, SecurityScheme};
-use utoipa::openapi::{OpenApi, Ref, RefOr, Response, Schema};
+use utoipa::openapi::{OpenApi, PathItem, Paths, Ref, RefOr, Required, Response, Schema};
 use utoipa::{OpenApi as _, ToSchema as _};
 
 /// The media type of every answer that is not a success.
@@ -34,6 +36,8 @@ const PROBLEM: &str = "application/problem+json";
         crate::job::preview::MeshPreview,
         crate::job::ProgressView,
         super::list::LabelFilter,
+        crate::notify::payload::Notice,
+        crate::notify::payload::NoticeOfJob,
     )),
 )]
 struct Base;
@@ -45,6 +49,7 @@ pub(super) fn base() -> OpenApi {
 
 /// Gives every problem its body, every operation the problems that any of them can have, and answers the links to what follows them.
 pub(super) fn complete(mut document: OpenApi) -> OpenApi {
+    document.webhooks = Some(webhooks());
     for (path, item) in &mut document.paths.paths {
         let operations =
             [&mut item.get, &mut item.head, &mut item.post, &mut item.delete, &mut item.put, &mut item.patch];
@@ -95,6 +100,39 @@ fn never_null(parameter: &mut RefOr<Parameter>) {
             *schema_type = SchemaType::Type(one.clone());
         }
     }
+}
+
+/// What the service sends by itself.
+fn webhooks() -> Paths {
+    let header = |name: &str, description: &str| {
+        let text = ObjectBuilder::new().schema_type(Type::String).build();
+        let header = ParameterBuilder::new().name(name).parameter_in(ParameterIn::Header).required(Required::True);
+        header.description(Some(description)).schema(Some(text)).build()
+    };
+    let notice = ContentBuilder::new().schema(Some(Ref::from_schema_name(Notice::name()))).build();
+    let body = RequestBodyBuilder::new().content("application/json", notice).required(Some(Required::True)).build();
+    let told = OperationBuilder::new()
+        .operation_id(Some("job_ended"))
+        .summary(Some("Tells that a job has ended"))
+        .description(Some(
+            "Posted to the `webhook` of the job, at least once, after the Standard Webhooks specification.",
+        ))
+        .parameter(header("webhook-id", "the same for every attempt"))
+        .parameter(header("webhook-timestamp", "when this attempt was made, seconds since 1970"))
+        .parameter(header(
+            "webhook-signature",
+            "`v1,` and HMAC-SHA256 of id, timestamp and body in base64; one for every secret",
+        ))
+        .request_body(Some(body))
+        .response("2XX", Response::new("it was taken"))
+        .response(
+            "410",
+            Response::new("nothing more is to be sent; any other answer is a failure, and it is sent again"),
+        )
+        .build();
+    let mut paths = Paths::new();
+    paths.paths.insert("job_ended".to_owned(), PathItem::new(HttpMethod::Post, told));
+    paths
 }
 
 fn describe_problems(operation: &mut Operation) {

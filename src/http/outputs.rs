@@ -5,16 +5,20 @@ use super::jobs::job_id;
 use super::{App, Problem, query};
 use crate::auth::{Caller, Scope};
 use crate::blobs::{BlobError, BlobId};
-use crate::job::OutputName;
+use crate::job::{Output, OutputName};
 use crate::telemetry::metrics;
+use crate::tenant::Tenant;
 use axum::body::Body;
 use axum::extract::{Path, RawQuery, State};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD;
+use bytes::Bytes;
 use futures::TryStreamExt;
+use futures::stream::BoxStream;
 use jiff::Timestamp;
+use std::ops::Range;
 
 /// What a job made never changes, and may be forgotten: a day in a private cache.
 const CACHE: &str = "private, max-age=86400, immutable";
@@ -59,26 +63,7 @@ pub async fn download(
 ) -> Result<Response, Problem> {
     let tenant = caller.may(Scope::Read)?;
     query::parameters(raw.as_deref(), &[], &[])?;
-    let id = job_id(&id)?;
-    let job = app.engine.get(tenant, id).await?.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
-    let unknown = || {
-        let detail = format!("the job has no output {name:?}");
-        Problem::not_found("unknown_output", "there is no such output", detail)
-    };
-    let kind = OutputName::from_name(&name).ok_or_else(unknown)?;
-    if !job.state.ended() {
-        let detail = "outputs are there once the job has succeeded";
-        return Err(Problem::conflict("job_not_ended", "the job has not ended", detail).retry_after(1));
-    }
-    let output = job.outputs.iter().find(|o| o.name == name).ok_or_else(unknown)?;
-    let expired = || {
-        let detail = "the job is remembered, its bytes are not";
-        Problem::new(StatusCode::GONE, "output_expired", "the output is no longer kept", detail)
-    };
-    if app.retention.expired(Timestamp::now()).is_some_and(|before| job.finished_at < Some(before)) {
-        return Err(expired());
-    }
-    let blob = BlobId::from_hex(&output.sha256).ok_or_else(Problem::internal)?;
+    let Made { output, kind, blob } = find(&app, tenant, &id, &name).await?;
     let tag = format!("\"{}\"", output.sha256);
     let digest = format!("sha-256=:{}:", BASE64_STANDARD.encode(blob.bytes()));
 
@@ -121,13 +106,58 @@ pub async fn download(
     };
     let length = range.as_ref().map_or(output.bytes, |r| r.end - r.start);
     set(header::CONTENT_LENGTH, &length.to_string())?;
-    let bytes = match app.blobs.stream(blob, range).await {
-        Ok(bytes) => bytes,
-        Err(BlobError::Missing) => return Err(expired()),
-        Err(error) => return Err(error.into()),
-    };
+    let bytes = read(&app, blob, range).await?;
     let name = kind.name();
     let counted = bytes.inspect_ok(move |bytes| metrics::downloaded(name, bytes.len() as u64));
     let body = if method == Method::HEAD { Body::empty() } else { Body::from_stream(counted) };
     Ok((status, answer, body).into_response())
+}
+
+/// An output that is kept.
+pub(crate) struct Made {
+    /// What the job says of it.
+    pub output: Output,
+    /// Which one it is.
+    pub kind: OutputName,
+    /// Its bytes.
+    pub blob: BlobId,
+}
+
+/// An output of a job that has ended.
+pub(crate) async fn find(app: &App, tenant: &Tenant, id: &str, name: &str) -> Result<Made, Problem> {
+    let id = job_id(id)?;
+    let job = app.engine.get(tenant, id).await?.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
+    let unknown = || {
+        let detail = format!("the job has no output {name:?}");
+        Problem::not_found("unknown_output", "there is no such output", detail)
+    };
+    let kind = OutputName::from_name(name).ok_or_else(unknown)?;
+    if !job.state.ended() {
+        let detail = "outputs are there once the job has succeeded";
+        return Err(Problem::conflict("job_not_ended", "the job has not ended", detail).retry_after(1));
+    }
+    let finished_at = job.finished_at;
+    let output = job.outputs.into_iter().find(|o| o.name == name).ok_or_else(unknown)?;
+    if app.retention.expired(Timestamp::now()).is_some_and(|before| finished_at < Some(before)) {
+        return Err(expired());
+    }
+    let blob = BlobId::from_hex(&output.sha256).ok_or_else(Problem::internal)?;
+    Ok(Made { output, kind, blob })
+}
+
+/// The bytes of an output, or a range of them, as they are read.
+pub(crate) async fn read(
+    app: &App,
+    blob: BlobId,
+    range: Option<Range<u64>>,
+) -> Result<BoxStream<'static, Result<Bytes, BlobError>>, Problem> {
+    app.blobs.stream(blob, range).await.map_err(|error| match error {
+        BlobError::Missing => expired(),
+        error => error.into(),
+    })
+}
+
+fn expired() -> Problem {
+    let detail = "the job is remembered, its bytes are not";
+    Problem::new(StatusCode::GONE, "output_expired", "the output is no longer kept", detail)
 }

@@ -81,6 +81,27 @@ impl Problem {
     pub fn detail(&self) -> &str {
         &self.0.detail
     }
+    /// The HTTP status.
+    pub fn status(&self) -> StatusCode {
+        self.0.status
+    }
+    /// Stable name of the problem type.
+    pub fn kind(&self) -> String {
+        format!("{TYPE_PREFIX}{}", self.0.code)
+    }
+    /// What kind of problem it is.
+    pub fn title(&self) -> &str {
+        &self.0.title
+    }
+    /// Faults by place.
+    pub fn errors(&self) -> &[FaultView] {
+        &self.0.errors
+    }
+    /// Seconds after which to try again, where that is known.
+    pub fn retry_after_s(&self) -> Option<u64> {
+        let header = self.0.headers.iter().find(|(name, _)| name == header::RETRY_AFTER);
+        header.and_then(|(_, value)| value.to_str().ok()?.parse().ok())
+    }
 
     /// 400: the request breaks a syntax.
     pub fn bad_request(code: &str, title: &str, detail: impl Into<String>) -> Self {
@@ -162,10 +183,10 @@ impl IntoResponse for Problem {
 }
 
 /// Writes the document, keeping the headers that the answer had (such as `Allow`).
-pub(super) fn render(problem: &Problem, request_id: &str, response: Response) -> Response {
-    let problem = problem.0.as_ref();
+pub(super) fn render(refused: &Problem, request_id: &str, response: Response) -> Response {
+    let problem = refused.0.as_ref();
     let document = ProblemDocument {
-        kind: format!("{TYPE_PREFIX}{}", problem.code),
+        kind: refused.kind(),
         title: problem.title.clone(),
         status: problem.status.as_u16(),
         code: problem.code.clone(),
@@ -182,7 +203,10 @@ pub(super) fn render(problem: &Problem, request_id: &str, response: Response) ->
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
     headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
     let body: Body = Json(document).into_response().into_body();
-    (problem.status, headers, body).into_response()
+    let mut response = (problem.status, headers, body).into_response();
+    // whoever speaks another language around this one tells it in that
+    response.extensions_mut().insert(refused.clone());
+    response
 }
 
 /// 404 for a path that is not served.
@@ -265,6 +289,7 @@ mod tests {
         let documented = std::fs::read_to_string(root.join("docs/problems.md")).expect("reads");
         let mut found = Vec::new();
         codes(&root.join("src/http"), &mut found);
+        codes(&root.join("src/grpc"), &mut found);
         assert!(found.len() > 20, "{found:?}");
         let missing: Vec<&String> = found.iter().filter(|code| !documented.contains(&format!("`{code}`"))).collect();
         assert!(missing.is_empty(), "not in docs/problems.md: {missing:?}");

@@ -185,6 +185,16 @@ pub struct JobSpec {
     /// Where the request was in its trace, so that the worker continues it: known to the engine only, no client can say it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub traceparent: Option<String>,
+    /// Who is told of the end.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub webhook: Option<WebhookSpec>,
+}
+
+/// Who is told of the end of a job.
+#[derive(Clone, Debug, PartialEq, Serialize, utoipa::ToSchema)]
+pub struct WebhookSpec {
+    /// Where the notice is posted: an `https` address of the public internet, unless the service lets others through.
+    pub url: String,
 }
 
 /// What a job does, by its kind.

@@ -13,7 +13,7 @@ use super::ledger::Version;
 use super::record::{Entry, Record};
 use crate::engine::sqlite::records::{self, Ctx, KEPT_EVENTS};
 use crate::engine::sqlite::writer::{Hub, Writer};
-use crate::engine::sqlite::{Readers, schema};
+use crate::engine::sqlite::{Readers, notices, schema};
 use crate::engine::{EngineError, EventPage, ListQuery, Page};
 use crate::job::{Event, JobId, JobKind, State};
 use crate::tenant::Tenant;
@@ -163,6 +163,12 @@ impl Projection {
         self.readers
             .run(move |c| c.prepare_cached("SELECT 1 FROM projected WHERE job = ?1")?.exists([id.to_string()]))
             .await
+    }
+
+    /// Jobs whose end is due to be told, the one that waits longest first.
+    pub(super) async fn due_notices(&self, now: Timestamp, limit: usize) -> Result<Vec<Name>, EngineError> {
+        let due = self.readers.run(move |c| notices::due(c, now.as_millisecond(), limit)).await?;
+        Ok(due.into_iter().map(|(tenant, id)| Name { tenant, id }).collect())
     }
 
     /// Jobs that ended before then.
@@ -339,7 +345,8 @@ fn upsert(ctx: &Ctx<'_>, id: &str, record: &Record, is_new: bool) -> rusqlite::R
         job.problem.as_ref().map(records::to_json).transpose()?,
         record.tenant.name(),
     ])?;
-    // what the tables beside hold changes only at the ends of a life
+    project_notice(ctx, id, record)?;
+    // what the other tables beside hold changes only at the ends of a life
     if !is_new && !job.state.ended() {
         return Ok(());
     }
@@ -351,6 +358,21 @@ fn upsert(ctx: &Ctx<'_>, id: &str, record: &Record, is_new: bool) -> rusqlite::R
     for (name, hash) in outputs.chain(record.held.iter().map(|(name, hash)| (name, hash))) {
         let text = "INSERT OR IGNORE INTO outputs (job, name, sha256) VALUES (?1, ?2, ?3)";
         ctx.connection.prepare_cached(text)?.execute(params![id, name, hash])?;
+    }
+    Ok(())
+}
+
+fn project_notice(ctx: &Ctx<'_>, id: &str, record: &Record) -> rusqlite::Result<()> {
+    let due = record.notice.as_ref().and_then(|notice| Some((notice, notice.due_ms?)));
+    match due {
+        Some((notice, due)) => {
+            let text = "INSERT OR REPLACE INTO notices (job, url, attempts, due_at) VALUES (?1, ?2, ?3, ?4)";
+            ctx.connection.prepare_cached(text)?.execute(params![id, notice.url, notice.attempts, due])?;
+        }
+        None if record.job.state.ended() => {
+            ctx.connection.prepare_cached("DELETE FROM notices WHERE job = ?1")?.execute([id])?;
+        }
+        None => {}
     }
     Ok(())
 }

@@ -31,6 +31,20 @@ pub(super) struct Record {
     pub hold: Option<Hold>,
     /// Blobs that are no outputs of its own, by name: hexadecimal SHA-256.
     pub held: Vec<(String, String)>,
+    /// Who is to be told of the end, until that is settled.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub notice: Option<Owed>,
+}
+
+/// A notice of the end that is owed. Its time is one of day, and nodes may disagree about it by what their clocks do: then it is sent
+/// earlier or later, or twice, which may happen anyway.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Owed {
+    pub url: String,
+    /// Attempts that were begun.
+    pub attempts: u32,
+    /// When the next one is due, milliseconds since the epoch; none before the end.
+    pub due_ms: Option<i64>,
 }
 
 /// A worker's hold. There is no time of day in it: see [`Leases`](super::leases).
@@ -111,7 +125,8 @@ impl Record {
         };
         let held = spec.work.held().into_iter().map(|(name, blob)| (name.to_owned(), blob));
         let held = held.chain(spec.work.inputs()).map(|(name, blob)| (name, blob.hex())).collect();
-        Self { job, tenant: new.tenant.clone(), last_seq: 0, losses: 0, hold: None, held }
+        let notice = spec.webhook.as_ref().map(|webhook| Owed { url: webhook.url.clone(), attempts: 0, due_ms: None });
+        Self { job, tenant: new.tenant.clone(), last_seq: 0, losses: 0, hold: None, held, notice }
     }
 
     pub(super) fn name(&self) -> Name {
@@ -228,6 +243,30 @@ impl Draft {
         }
     }
 
+    /// Begins an attempt to tell the end, if one is due; after `hold` the next one is.
+    pub(super) fn take_notice(&mut self, hold: Duration) -> bool {
+        let now = self.now.as_millisecond();
+        let Some(notice) = self.record.notice.as_mut().filter(|notice| notice.due_ms.is_some_and(|due| due <= now))
+        else {
+            return false;
+        };
+        notice.attempts += 1;
+        notice.due_ms = Some(now.saturating_add(hold.as_millis() as i64));
+        true
+    }
+
+    /// Notes what became of the newest attempt to tell the end; `false` when it is not the newest.
+    pub(super) fn settle_notice(&mut self, attempts: u32, next: Option<Timestamp>) -> bool {
+        let Some(notice) = self.record.notice.as_mut().filter(|notice| notice.attempts == attempts) else {
+            return false;
+        };
+        match next {
+            Some(next) => notice.due_ms = Some(next.as_millisecond()),
+            None => self.record.notice = None,
+        }
+        true
+    }
+
     fn go_with(&mut self, state: State, outputs: Vec<Output>, metrics: Option<Value>, problem: Option<Failure>) {
         // whoever held it holds it no more, unless it is only told to stop
         if state != State::Canceling {
@@ -241,6 +280,9 @@ impl Draft {
             // the clock of the node that ends it may be behind that of the one which began it
             job.finished_at = Some(self.now.max(job.started_at.unwrap_or(job.created_at)));
             job.eta_s = None;
+            if let Some(notice) = &mut self.record.notice {
+                notice.due_ms = Some(self.now.as_millisecond());
+            }
         }
         self.tell_state();
         if state.ended() {

@@ -1,5 +1,6 @@
 //! Rows and what they mean: records, events, and the changes that keep both together.
 
+use super::notices;
 use crate::engine::{Claim, EventPage, ListQuery, NewJob, Page, Renewal, Update};
 use crate::job::spec::Work;
 use crate::job::{Event, EventKind, Failure, Job, JobId, JobKind, Output, ProgressView, State};
@@ -261,6 +262,7 @@ pub(super) fn change(ctx: &mut Ctx<'_>, id: JobId, change: Change) -> rusqlite::
     }
     tell_state(ctx, id)?;
     if change.state.ended() {
+        notices::owe(ctx, id)?;
         let query = format!("SELECT {COLUMNS} FROM jobs WHERE id = ?1");
         let job = ctx.connection.prepare_cached(&query)?.query_row([id.to_string()], job_of)?;
         let job = serde_json::to_value(job).map_err(corrupt)?;

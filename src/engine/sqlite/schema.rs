@@ -4,7 +4,7 @@ use crate::engine::EngineError;
 use rusqlite::Connection;
 
 /// One step per version; `user_version` counts the steps that were taken. A step is never edited once released.
-const MIGRATIONS: [&str; 4] = [
+const MIGRATIONS: [&str; 5] = [
     "
     CREATE TABLE jobs (
         id          TEXT PRIMARY KEY,
@@ -95,6 +95,15 @@ const MIGRATIONS: [&str; 4] = [
     DROP TABLE idempotency;
     ALTER TABLE idempotency_of_tenants RENAME TO idempotency;
     CREATE INDEX idempotency_by_age ON idempotency (expires_at);
+    ",
+    "
+    CREATE TABLE notices (
+        job      TEXT PRIMARY KEY REFERENCES jobs (id) ON DELETE CASCADE,
+        url      TEXT NOT NULL,
+        attempts INTEGER NOT NULL,
+        due_at   INTEGER NOT NULL
+    ) STRICT, WITHOUT ROWID;
+    CREATE INDEX notices_by_time ON notices (due_at);
 ",
 ];
 

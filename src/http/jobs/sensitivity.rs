@@ -1,6 +1,6 @@
 //! `/v1/jobs/{id}/sensitivity`: how a loss of a job's surface changes with the network that it came from.
 
-use super::{App, Problem, answer_submit, body, idempotency_key, job_id, query, surface_blob, tell_accepted};
+use super::{App, Problem, accepted, answer_submit, body, idempotency_key, job_id, query, surface_blob, tell_accepted};
 use crate::auth::{Caller, Scope};
 use crate::blobs::BlobId;
 use crate::engine::{IdempotencyKey, NewJob};
@@ -72,7 +72,7 @@ pub async fn differentiate(
     if let Some(key) = &key
         && let Some(answer) = app.engine.recall(tenant, key.clone()).await?
     {
-        return answer_submit(&app, tenant, &headers, answer).await;
+        return answer_submit(&app, tenant, &headers, accepted(answer)?).await;
     }
     if app.stop.is_cancelled() {
         return Err(Problem::unavailable("stopping", "the service is stopping"));
@@ -83,12 +83,17 @@ pub async fn differentiate(
     let mut sensing = sensing(&app, tenant, &job).await?;
     sensing.gradient = app.blobs.put_unseen(bytes).await?;
     let outputs = OutputName::of(JobKind::Sensitivity).to_vec();
-    let spec =
-        JobSpec { work: Work::Sensitivity(Box::new(sensing)), outputs, labels: BTreeMap::new(), traceparent: None };
+    let spec = JobSpec {
+        work: Work::Sensitivity(Box::new(sensing)),
+        outputs,
+        labels: BTreeMap::new(),
+        traceparent: None,
+        webhook: None,
+    };
     let submitted = app.engine.submit(NewJob { tenant: tenant.clone(), id: JobId::new(), spec, key }).await?;
     drop(promise);
     tell_accepted(&submitted, clock);
-    answer_submit(&app, tenant, &headers, submitted).await
+    answer_submit(&app, tenant, &headers, accepted(submitted)?).await
 }
 
 /// What is differentiated of a job, with its surface in the place of the gradient.

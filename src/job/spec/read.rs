@@ -2,7 +2,7 @@
 
 use super::{
     FieldSpec, Fitting, JobSpec, MAX_LABEL_NAME, MAX_LABEL_VALUE, MAX_LABELS, MAX_LATENT, OutputName, SAMPLES, Sensing,
-    Shrinking, WarmStartSpec, Work, check_lattice,
+    Shrinking, WarmStartSpec, WebhookSpec, Work, check_lattice,
 };
 use crate::blobs::BlobId;
 use crate::extract::Budget;
@@ -113,14 +113,25 @@ pub fn read_spec(value: &Value, faults: &mut Faults) -> JobSpec {
             None => (Work::Fit(Fitting { meshes: Vec::new(), fit: FitSpec::default() }), Vec::new()),
         },
     };
-    let mut spec = JobSpec { work, outputs, labels: BTreeMap::new(), traceparent: None };
+    let mut spec = JobSpec { work, outputs, labels: BTreeMap::new(), traceparent: None, webhook: None };
     if let Some(outputs) = value.get("outputs") {
         spec.outputs = read_outputs(outputs, kind, faults);
     }
     if let Some(labels) = value.get("labels") {
         spec.labels = read_labels(labels, faults);
     }
+    spec.webhook = value.get("webhook").and_then(|webhook| read_webhook(webhook, faults));
     spec
+}
+
+/// Reads who is told of the end; which addresses are let through is known to the service.
+fn read_webhook(value: &Value, faults: &mut Faults) -> Option<WebhookSpec> {
+    let object = faults.object(value, "/webhook", &["url"])?;
+    let Some(url) = object.get("url") else {
+        faults.add("/webhook/url", "missing_member", "a webhook needs a url");
+        return None;
+    };
+    faults.string(url, "/webhook/url").map(|url| WebhookSpec { url: url.to_owned() })
 }
 
 /// Reads what the engine stored of a sensitivity.
@@ -140,7 +151,7 @@ fn read_sensing(value: &Value, faults: &mut Faults) -> Option<Sensing> {
 /// Reads what a fit is of.
 fn read_fitting(value: &Value, faults: &mut Faults) -> Fitting {
     let mut fitting = Fitting { meshes: Vec::new(), fit: FitSpec::default() };
-    let Some(object) = faults.object(value, "", &["kind", "meshes", "fit", "outputs", "labels"]) else {
+    let Some(object) = faults.object(value, "", &["kind", "meshes", "fit", "outputs", "labels", "webhook"]) else {
         return fitting;
     };
     match object.get("meshes") {
@@ -213,7 +224,8 @@ fn read_shrinking(value: &Value, faults: &mut Faults) -> Shrinking {
         shrink: ShrinkSpec::default(),
         budget: Budget::default(),
     };
-    let known = ["kind", "field", "weight", "warm_start", "latent_motion", "shrink", "budget", "outputs", "labels"];
+    let known =
+        ["kind", "field", "weight", "warm_start", "latent_motion", "shrink", "budget", "outputs", "labels", "webhook"];
     let Some(object) = faults.object(value, "", &known) else { return spec };
     match object.get("field") {
         Some(field) => spec.field = read_field(field, "/field", faults),
