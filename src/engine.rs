@@ -197,11 +197,14 @@ impl Outcome {
     }
 }
 
+/// Numbers of jobs by kind and state.
+pub type Counts = Vec<(JobKind, State, u64)>;
+
 /// How much there is to do.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Depth {
     /// How many jobs there are of a kind in a state; only of those that have not ended, and only where there are any.
-    pub open: Vec<(JobKind, State, u64)>,
+    pub open: Counts,
     /// When the oldest job that is queued was accepted.
     pub oldest_queued: Option<Timestamp>,
     /// Whether the engine is connected to where the jobs are kept.

@@ -1,6 +1,6 @@
 //! The service over gRPC, on the port of HTTP: the same jobs, the same checks, the same numbers of events.
 //!
-//! Guarantees: whatever the [HTTP room](crate::http) refuses is refused here with the same problem ([`refusal`]), also when a
+//! Guarantees: whatever the [HTTP room](crate::http) refuses is refused here with the same problem (`refusal`), also when a
 //! layer around the routes refuses it ([`speak`]); a call ends at its deadline (`grpc-timeout`), and an open stream ends when
 //! the service stops, with `UNAVAILABLE`, so that a client does not take it for the end of a job. Health is that of `/readyz`.
 //! Not offered: gRPC-Web, compression of messages, and `sensitivity`, which is asked for over HTTP.

@@ -2,7 +2,7 @@
 //!
 //! Guarantees: a token counts only when it is signed by a key that the issuer publishes, with one of the configured algorithms (never
 //! `none`, and never one with a shared secret), by this issuer, for this audience, and now. The issuer's keys are kept at hand:
-//! they are read again every [`FRESH`] and when a token names a key that is not among them, at most every [`LEAST`], so that nobody can
+//! they are read again every `FRESH` and when a token names a key that is not among them, at most every `LEAST`, so that nobody can
 //! make this service hammer the issuer. While the issuer is away the keys at hand serve on.
 //! Not guaranteed: that a token stops working before it expires; and a key that the issuer withdraws works on here until the issuer was
 //! read again.

@@ -1,7 +1,7 @@
 //! Who asks.
 //!
 //! The [`identify`] layer finds out who sends a request and puts a [`Caller`] into its extensions, where handlers of every protocol
-//! find it. Whoever is not known is refused there, on every route but the few in [`OPEN`]; a handler that takes a `Caller` cannot be
+//! find it. Whoever is not known is refused there, on every route but the few in `OPEN`; a handler that takes a `Caller` cannot be
 //! reached without one, and comes to a tenant only by saying what it is about to do ([`Caller::may`]).
 //!
 //! A key or token comes in the header `Authorization: Bearer` (RFC 6750, section 2.1) and nowhere else: a query would be logged, by

@@ -1,6 +1,7 @@
 //! Spans as a collector gets them, from one process and from two.
 
 use crate::app::{App, PATIENCE, small};
+use crate::cluster::nats_server;
 use axum::Router;
 use axum::body::Bytes;
 use axum::routing::post;
@@ -12,9 +13,6 @@ use serde_json::Value;
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
-
-#[path = "../support/nats_server.rs"]
-mod nats_server;
 
 /// The standard's own example.
 const TRACE: &str = "0af7651916cd43dd8448eb211c80319c";

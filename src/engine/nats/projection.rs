@@ -14,8 +14,8 @@ use super::record::{Entry, Record};
 use crate::engine::sqlite::records::{self, Ctx, KEPT_EVENTS};
 use crate::engine::sqlite::writer::{Hub, Writer};
 use crate::engine::sqlite::{Readers, notices, schema};
-use crate::engine::{EngineError, EventPage, ListQuery, Page};
-use crate::job::{Event, JobId, JobKind, State};
+use crate::engine::{Counts, EngineError, EventPage, ListQuery, Page};
+use crate::job::{Event, JobId};
 use crate::tenant::Tenant;
 use jiff::Timestamp;
 use rusqlite::{Connection, OptionalExtension, params};
@@ -101,7 +101,7 @@ impl Projection {
     }
 
     /// How many jobs there are of each kind in each state that is no end, and when the oldest queued one was accepted.
-    pub(super) async fn depth(&self) -> Result<(Vec<(JobKind, State, u64)>, Option<Timestamp>), EngineError> {
+    pub(super) async fn depth(&self) -> Result<(Counts, Option<Timestamp>), EngineError> {
         self.readers.run(records::depth).await
     }
 

@@ -1,7 +1,7 @@
 //! Rows and what they mean: records, events, and the changes that keep both together.
 
 use super::notices;
-use crate::engine::{Claim, EventPage, ListQuery, NewJob, Page, Renewal, Update};
+use crate::engine::{Claim, Counts, EventPage, ListQuery, NewJob, Page, Renewal, Update};
 use crate::job::spec::Work;
 use crate::job::{Event, EventKind, Failure, Job, JobId, JobKind, Output, ProgressView, State};
 use crate::tenant::Tenant;
@@ -218,9 +218,7 @@ pub(in crate::engine) fn list(connection: &Connection, tenant: &Tenant, query: &
 }
 
 /// How many jobs there are of each kind in each state that is no end, and when the oldest queued one was accepted.
-pub(in crate::engine) fn depth(
-    connection: &Connection,
-) -> rusqlite::Result<(Vec<(JobKind, State, u64)>, Option<Timestamp>)> {
+pub(in crate::engine) fn depth(connection: &Connection) -> rusqlite::Result<(Counts, Option<Timestamp>)> {
     let text = "SELECT kind, state, COUNT(*), MIN(created_at) FROM jobs
                 WHERE state IN ('queued', 'running', 'canceling') GROUP BY kind, state";
     let mut statement = connection.prepare_cached(text)?;
