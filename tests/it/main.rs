@@ -13,6 +13,7 @@ mod evaluate;
 mod faults;
 mod fit;
 mod grpc;
+mod issuer;
 mod losses;
 mod metrics;
 mod monitoring;
