@@ -244,7 +244,7 @@ fn seeds_of_the_fuzz_targets_are_read_but_for_those_that_are_there_to_be_refused
     let seeds = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("fuzz/seeds");
     let refused = [
         ("mesh", &["too_long.stl", "too_many.ply", "own_child.glb"][..]),
-        ("npy", &["cut", "integers", "not_finite", "too_many", "two_axes"]),
+        ("npy", &["codes_fortran", "cut", "integers", "no_columns", "not_finite", "too_many", "two_axes"]),
         (
             "safetensors",
             &["deep_sdf_half_a_norm", "long_header", "overflowing_shape", "own_not_finite", "own_wrong_width"],
