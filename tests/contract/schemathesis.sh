@@ -51,7 +51,8 @@ PYTHON
 canceler=$!
 
 cd "$work"
+# a scene holds scenes, so the least example of a job is large; that is no fault of the service, and generating goes on all the same
 "$tool/bin/st" --config-file "$here/schemathesis.toml" run "$url/openapi.json" \
-  --phases examples,coverage,fuzzing,stateful --checks all --mode all --seed 1 --max-examples "${SCHEMATHESIS_EXAMPLES:-40}" \
+  --suppress-health-check large_base_example --phases examples,coverage,fuzzing,stateful --checks all --mode all --seed 1 --max-examples "${SCHEMATHESIS_EXAMPLES:-40}" \
   --generation-deterministic --continue-on-failure --request-timeout 90 --no-color
 "$program" healthcheck "$url"

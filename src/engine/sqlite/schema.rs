@@ -3,6 +3,9 @@
 use crate::engine::EngineError;
 use rusqlite::Connection;
 
+/// Marks a database as ours (SQLite's `application_id`): "shkd".
+pub(super) const APPLICATION: i32 = 0x7368_6b64;
+
 /// One step per version; `user_version` counts the steps that were taken. A step is never edited once released.
 const MIGRATIONS: [&str; 5] = [
     "
