@@ -5,6 +5,7 @@
 
 use crate::engine::nats::{Address, InvalidAddress};
 use crate::notify::signature::Secret;
+use crate::quota::Quotas;
 use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
 use ipnet::IpNet;
@@ -39,8 +40,10 @@ pub struct Config {
     pub role: Role,
     /// Who may ask.
     pub auth: AuthConfig,
-    /// Sizes of requests.
+    /// Sizes of requests, and what jobs may take.
     pub limits: Limits,
+    /// What each tenant may have.
+    pub quotas: Quotas,
     /// What is kept, and for how long.
     pub retention: Retention,
     /// The worker.
@@ -148,7 +151,7 @@ impl Retention {
     }
 }
 
-/// Sizes of requests.
+/// Sizes of requests, and what jobs may take.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Limits {
@@ -156,6 +159,12 @@ pub struct Limits {
     pub body_bytes: u64,
     /// Bytes of an uploaded input (`SHRINKD_LIMITS__INPUT_BYTES`): 256 MiB, held in memory while it is checked.
     pub input_bytes: u64,
+    /// Jobs that may wait, over all tenants (`SHRINKD_LIMITS__QUEUED_JOBS`): 0 is no limit.
+    pub queued_jobs: u64,
+    /// Seconds that an attempt at a job may run (`SHRINKD_LIMITS__JOB_SECONDS`).
+    pub job_seconds: u32,
+    /// Bytes of memory that a job may be estimated to take (`SHRINKD_LIMITS__JOB_BYTES`): 0 is what this node's worker has.
+    pub job_bytes: u64,
 }
 
 /// The worker.
@@ -232,7 +241,14 @@ impl Default for Config {
             role: Role::All,
             auth: AuthConfig::default(),
             retention: Retention { outputs_s: 0, inputs_s: 7 * 24 * 3600, every_s: 3600 },
-            limits: Limits { body_bytes: 1 << 20, input_bytes: 256 << 20 },
+            limits: Limits {
+                body_bytes: 1 << 20,
+                input_bytes: 256 << 20,
+                queued_jobs: 100_000,
+                job_seconds: 3600,
+                job_bytes: 0,
+            },
+            quotas: Quotas::default(),
             worker: WorkerConfig { slots: 2, threads: 0, lease_s: 30, max_losses: 5 },
             webhooks: WebhooksConfig { ports: vec![443], ..WebhooksConfig::default() },
             log: LogConfig { format: LogFormat::Pretty, filter: "info".to_owned() },
@@ -274,7 +290,8 @@ impl Config {
                 config.role != Role::All && config.engine == SQLITE,
                 "role api or worker needs an engine that other nodes reach: engine = \"nats://...\"",
             ),
-            (config.limits.body_bytes == 0 || config.limits.input_bytes == 0, "limits must be at least 1"),
+            (config.limits.body_bytes == 0 || config.limits.input_bytes == 0, "limits of bytes must be at least 1"),
+            (config.limits.job_seconds == 0, "limits.job_seconds must be at least 1"),
         ];
         if let Some((_, why)) = wrong.iter().find(|(is_wrong, _)| *is_wrong) {
             return Err(ConfigError::Impossible(why));

@@ -5,6 +5,10 @@
 //! once; its events are numbered from 1 without a gap, and are durable before anyone reads them.
 //! Every job belongs to a [`Tenant`]. Whoever asks about a job says for whom, and another tenant's job is not there: it is looked
 //! for where it is not, so that neither the answer nor its time differs from that of a job which never was.
+//! Workers are given jobs in turn: of the tenants with jobs that wait, the one with the fewest that run, and of these the one that has
+//! waited longest for its turn; and of its jobs the oldest. So a tenant's one job waits for a slot, and never behind another tenant's queue.
+//! What a tenant may have is judged when it submits. Engines of several nodes judge by what the node has heard, so that submits at the same
+//! moment on several nodes may exceed it by a few.
 //! Not guaranteed: that a job runs only once (a worker that is lost in the middle is followed by another attempt), and that
 //! old events are kept (a reader that comes too late gets a fresh snapshot). Whoever is to be told of an end is owed that from the
 //! moment of the end, and until somebody settles it.
@@ -17,6 +21,7 @@ pub mod sqlite;
 pub use observed::Observed;
 
 use crate::job::{Event, EventKind, Failure, Job, JobId, JobKind, JobSpec, Output, ProgressView, State};
+use crate::quota::{Exceeded, Quotas};
 use crate::tenant::Tenant;
 use futures::stream::BoxStream;
 use jiff::Timestamp;
@@ -24,19 +29,23 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// How leases and attempts are judged.
-#[derive(Clone, Copy, Debug)]
+/// How leases, attempts and tenants are judged.
+#[derive(Clone, Debug)]
 pub struct Terms {
     /// How long a claim lasts without a renewal.
     pub lease: Duration,
     /// Lost attempts after which a job is failed.
     pub max_losses: u32,
+    /// Jobs that may wait, over all tenants; 0 is no limit.
+    pub queue: u64,
+    /// What each tenant may have.
+    pub quotas: Arc<Quotas>,
 }
 
 impl Default for Terms {
-    /// 30 s (three heartbeats of 10 s), and five losses: a job that kills its worker five times is poison.
+    /// 30 s (three heartbeats of 10 s), and five losses: a job that kills its worker five times is poison. No quotas.
     fn default() -> Self {
-        Self { lease: Duration::from_secs(30), max_losses: 5 }
+        Self { lease: Duration::from_secs(30), max_losses: 5, queue: 0, quotas: Arc::default() }
     }
 }
 
@@ -58,6 +67,8 @@ pub struct NewJob {
     pub id: JobId,
     /// The checked request.
     pub spec: JobSpec,
+    /// Vertices that it asks for, which its tenant's quota counts.
+    pub vertices: u64,
     /// The key of the request, if it has one.
     pub key: Option<IdempotencyKey>,
 }
@@ -73,6 +84,10 @@ pub enum Submitted {
     KeyConflict,
     /// A submit with this key is not finished yet.
     InFlight,
+    /// It was not accepted: as many jobs wait as may, over all tenants.
+    QueueFull,
+    /// It was not accepted: its tenant has what it may have.
+    OverQuota(Exceeded),
 }
 
 /// What to list, newest first.
@@ -235,7 +250,7 @@ pub enum EngineError {
 /// The queue and the records. See the module for the guarantees.
 #[async_trait::async_trait]
 pub trait Engine: Send + Sync {
-    /// Accepts a job.
+    /// Accepts a job, unless its tenant or the queue has no room for it. A submit that repeats an earlier one is answered in any case.
     async fn submit(&self, job: NewJob) -> Result<Submitted, EngineError>;
     /// What a submit with this key would be answered without accepting anything; `None` when the key is new.
     async fn recall(&self, tenant: &Tenant, key: IdempotencyKey) -> Result<Option<Submitted>, EngineError>;
@@ -260,7 +275,7 @@ pub trait Engine: Send + Sync {
         expired: Option<Timestamp>,
     ) -> Result<Vec<String>, EngineError>;
 
-    /// Takes up to `slots` jobs, oldest first, waiting at most `wait` for the first.
+    /// Takes up to `slots` jobs, each in its tenant's turn, waiting at most `wait` for the first.
     async fn claim(&self, worker: &str, slots: usize, wait: Duration) -> Result<Vec<Claim>, EngineError>;
     /// Extends a claim and tells its news.
     async fn renew(&self, claim: &Claim, news: Vec<Update>) -> Result<Renewal, EngineError>;

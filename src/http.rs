@@ -19,6 +19,7 @@ pub mod outputs;
 pub mod page;
 pub mod problem;
 pub mod query;
+pub mod rates;
 
 pub use problem::Problem;
 
@@ -30,6 +31,8 @@ use crate::notify::target::Rules;
 use crate::telemetry::metrics::Exposition;
 use axum::http::HeaderValue;
 use axum::middleware;
+use caller::Door;
+use rates::Rates;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio_util::sync::CancellationToken;
@@ -57,6 +60,8 @@ pub struct App {
     pub metrics_apart: bool,
     /// Who may be told of the ends of jobs; none where nobody is.
     pub webhooks: Option<Rules>,
+    /// How often tenants may ask this node.
+    pub rates: Arc<Rates>,
     /// Raised when the service stops.
     pub stop: CancellationToken,
 }
@@ -97,7 +102,8 @@ pub fn health_router(app: App, others: axum::Router) -> axum::Router {
         .split_for_parts();
     let router = router.fallback(problem::unknown_route).method_not_allowed_fallback(problem::wrong_method);
     // it has nothing of any tenant
-    let router = router.with_state(app).merge(others).layer(middleware::from_fn_with_state(None, caller::identify));
+    let door = Door { authenticator: None, rates: Arc::default() };
+    let router = router.with_state(app).merge(others).layer(middleware::from_fn_with_state(door, caller::identify));
     router.layer(middleware::from_fn(context::request))
 }
 
@@ -109,13 +115,14 @@ pub fn router(
     others: axum::Router,
 ) -> axum::Router {
     let (router, _) = api().split_for_parts();
+    let door = Door { authenticator, rates: app.rates.clone() };
     let mut router = router
         .fallback(problem::unknown_route)
         .method_not_allowed_fallback(problem::wrong_method)
         .with_state(app)
         .merge(others)
         .layer(CatchPanicLayer::custom(problem::panicked))
-        .layer(middleware::from_fn_with_state(authenticator, caller::identify));
+        .layer(middleware::from_fn_with_state(door, caller::identify));
     if !cors_origins.is_empty() {
         let origins: Vec<HeaderValue> = cors_origins.iter().filter_map(|o| o.parse().ok()).collect();
         let cors = CorsLayer::new().allow_origin(origins).allow_methods(tower_http::cors::Any);

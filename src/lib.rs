@@ -14,6 +14,7 @@ pub mod http;
 pub mod job;
 pub mod measure;
 pub mod notify;
+pub mod quota;
 pub mod settings;
 pub mod shrink;
 pub mod surface;

@@ -17,14 +17,19 @@ const PAUSE: Duration = Duration::from_millis(500);
 
 /// Opens the engine. What a cluster's node keeps for itself goes to the data folder.
 pub async fn open_engine(config: &Config) -> Result<Arc<dyn Engine>, Box<dyn std::error::Error>> {
-    let terms = Terms { lease: Duration::from_secs(config.worker.lease_s), max_losses: config.worker.max_losses };
+    let terms = Terms {
+        lease: Duration::from_secs(config.worker.lease_s),
+        max_losses: config.worker.max_losses,
+        queue: config.limits.queued_jobs,
+        quotas: Arc::new(config.quotas.clone()),
+    };
     if config.engine == SQLITE {
         return Ok(Arc::new(Observed(Arc::new(SqliteEngine::open(&config.data_dir, terms)?))));
     }
     let address: Address = config.engine.parse()?;
     let (folder, patience) = (config.data_dir.join("projection"), Instant::now() + READY);
     loop {
-        match NatsEngine::open(&address, &folder, terms).await {
+        match NatsEngine::open(&address, &folder, terms.clone()).await {
             Ok(engine) => {
                 tracing::info!(nats.servers = %address, "joined the cluster");
                 return Ok(Arc::new(Observed(Arc::new(engine))));

@@ -8,6 +8,7 @@ use crate::auth::keys::KeyRing;
 use crate::blobs::Blobs;
 use crate::config::{AuthMode, Config, FOLDER, Role, SQLITE};
 use crate::grpc;
+use crate::http::rates::Rates;
 use crate::http::{self, App};
 use crate::job::worker::Worker;
 use crate::job::{collector, priority};
@@ -151,6 +152,7 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
         blobs: blobs_of_worker,
         pool: Arc::new(pool),
         slots: config.worker.slots,
+        job_seconds: config.limits.job_seconds,
         name: format!("worker-{}", uuid::Uuid::now_v7()),
     };
     let worker = (config.role != Role::Api).then(|| tokio::spawn(worker().run(stop.clone())));
@@ -170,6 +172,7 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
         metrics: exposition,
         metrics_apart: config.metrics_listen.is_some(),
         webhooks: (!config.webhooks.secrets.is_empty()).then(|| Rules::from(&config.webhooks)),
+        rates: Arc::new(Rates::new(config.quotas.clone())),
         stop: stop.clone(),
     };
     if let Some(address) = config.metrics_listen {

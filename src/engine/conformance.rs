@@ -2,18 +2,19 @@
 //!
 //! ```no_run
 //! # async fn example(engine: std::sync::Arc<dyn shrinkd::engine::Engine>) {
-//! // the engine's leases must last `conformance::LEASE`, and it must give up after two lost attempts
+//! // the engine must have been opened with `conformance::terms()`
 //! shrinkd::engine::conformance::run(engine).await;
 //! # }
 //! ```
 
 use super::{
     Claim, Depth, DueNotice, Engine, EngineError, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Renewal,
-    Submitted, Update, follow,
+    Submitted, Terms, Update, follow,
 };
 use crate::blobs::BlobId;
 use crate::job::spec::{WarmStartSpec, Work};
 use crate::job::{Event, EventKind, Failure, JobId, JobKind, JobSpec, Output, ProgressView, State};
+use crate::quota::{Exceeded, Exception, HOUR, Quotas};
 use crate::tenant::Tenant;
 use futures::StreamExt;
 use jiff::Timestamp;
@@ -23,8 +24,26 @@ use std::time::Duration;
 
 /// The lease that an engine under test is opened with: long enough for a slow machine to renew, short enough to wait for.
 pub const LEASE: Duration = Duration::from_millis(1500);
+/// Jobs that may wait in an engine under test.
+const QUEUE: u64 = 60;
 /// Longer than any step of the suite may take.
 const PATIENCE: Duration = Duration::from_secs(20);
+
+/// What an engine under test is opened with.
+pub fn terms() -> Terms {
+    let none = Exception::default();
+    let bounded = [
+        (tenant("jobs"), Exception { queued: Some(2), running: Some(1), ..none }),
+        (tenant("vertices"), Exception { vertices_per_hour: Some(100), ..none }),
+        (tenant("seconds"), Exception { seconds_per_hour: Some(1), ..none }),
+    ];
+    let quotas = Quotas { tenants: bounded.into(), ..Quotas::default() };
+    Terms { lease: LEASE, max_losses: 2, queue: QUEUE, quotas: Arc::new(quotas) }
+}
+
+fn tenant(name: &str) -> Tenant {
+    name.parse().unwrap_or_else(|e| panic!("{name}: {e}"))
+}
 
 /// Whose the suite's jobs are, where it is not about tenants.
 fn own() -> Tenant {
@@ -40,7 +59,7 @@ fn labeled(name: &str, value: &str) -> NewJob {
     let request = json!({"field": {"scene": {"sphere": {"radius": 0.5}}}, "labels": {name: value}});
     let spec =
         JobSpec::from_value(&request).unwrap_or_else(|faults| panic!("the suite's own job is refused: {faults:?}"));
-    NewJob { tenant: own(), id: JobId::new(), spec, key: None }
+    NewJob { tenant: own(), id: JobId::new(), spec, vertices: 0, key: None }
 }
 
 /// Runs every claim, one after the other, on an engine that holds no job.
@@ -67,6 +86,10 @@ pub async fn run(engine: Arc<dyn Engine>) {
     keys_and_labels_are_each_tenants_own(&engine).await;
     what_there_is_to_do_is_counted(&engine).await;
     an_end_is_told_until_that_is_settled(&engine).await;
+    tenants_take_turns(&engine).await;
+    what_a_tenant_has_at_once_is_limited(&engine).await;
+    what_a_tenants_jobs_cost_is_limited(&engine).await;
+    a_full_queue_takes_no_more(&engine).await;
     engine.health().await.expect("healthy");
 }
 
@@ -165,7 +188,7 @@ async fn a_key_makes_a_submit_repeatable(engine: &Arc<dyn Engine>) {
             }
             Submitted::Replayed(job) => answers.push(job),
             Submitted::InFlight => {}
-            Submitted::KeyConflict => panic!("the same request is no conflict"),
+            other => panic!("the same request is answered with its job, not with {other:?}"),
         }
     }
     assert_eq!(created, 1, "one key, one job");
@@ -264,7 +287,7 @@ async fn a_blob_is_named_while_a_job_remembers_it(engine: &Arc<dyn Engine>) {
     let request = json!({"field": {"input": input.to_string()}});
     let spec =
         JobSpec::from_value(&request).unwrap_or_else(|faults| panic!("the suite's own job is refused: {faults:?}"));
-    let id = submit(engine, NewJob { tenant: own(), id: JobId::new(), spec, key: None }).await;
+    let id = submit(engine, NewJob { tenant: own(), id: JobId::new(), spec, vertices: 0, key: None }).await;
     let unnamed = async |expired: Option<Timestamp>| {
         let blobs = vec![input.hex(), output.clone(), stray.clone()];
         engine.unnamed(None, blobs, expired).await.expect("answers")
@@ -475,10 +498,6 @@ async fn a_surface_is_kept_for_the_jobs_that_begin_from_it(engine: &Arc<dyn Engi
     assert_eq!(gone, Forgotten::Gone(vec!["other".to_owned(), surface.hex()]));
 }
 
-fn tenant(name: &str) -> Tenant {
-    name.parse().unwrap_or_else(|error| panic!("{name}: {error}"))
-}
-
 async fn another_tenants_job_is_not_there(engine: &Arc<dyn Engine>) {
     // one name that only a dot tells from the other, and one that is the beginning of another
     for (owner, stranger) in [("team.a", "team-a"), ("team", "team.b"), ("default", "other"), ("other", "default")] {
@@ -486,7 +505,7 @@ async fn another_tenants_job_is_not_there(engine: &Arc<dyn Engine>) {
         let input = BlobId::of(owner.name().as_bytes());
         let request = json!({"field": {"input": input.to_string()}, "labels": {"whose": owner.name()}});
         let spec = JobSpec::from_value(&request).unwrap_or_else(|faults| panic!("refused: {faults:?}"));
-        let id = submit(engine, NewJob { tenant: owner.clone(), id: JobId::new(), spec, key: None }).await;
+        let id = submit(engine, NewJob { tenant: owner.clone(), id: JobId::new(), spec, vertices: 0, key: None }).await;
         let (mut heard, mut not_heard) = (engine.changes(&owner, id), engine.changes(&stranger, id));
         let unseen = async || {
             assert_eq!(engine.get(&stranger, id).await.expect("answers"), None);
@@ -579,4 +598,122 @@ async fn what_there_is_to_do_is_counted(engine: &Arc<dyn Engine>) {
     engine.request_cancel(&Tenant::default(), second).await.expect("cancels");
     let after = engine.depth().await.expect("counts");
     assert_eq!((&after.open, after.oldest_queued, after.connected), (&before.open, None, true));
+}
+
+/// The suite's job of another tenant.
+fn of(name: &str) -> NewJob {
+    NewJob { tenant: tenant(name), ..new_job() }
+}
+
+async fn claim_tenants(engine: &Arc<dyn Engine>, slots: usize) -> Vec<Claim> {
+    engine.claim("a", slots, Duration::ZERO).await.expect("claims")
+}
+
+async fn cancel_all(engine: &Arc<dyn Engine>, claims: impl IntoIterator<Item = Claim>) {
+    for claim in claims {
+        engine.finish(&claim, Outcome::Canceled).await.expect("finishes");
+    }
+}
+
+async fn tenants_take_turns(engine: &Arc<dyn Engine>) {
+    let mut ids = Vec::new();
+    for _ in 0..8 {
+        ids.push(submit(engine, of("many")).await);
+    }
+    let running = claim_one(engine, "a").await;
+    assert_eq!(running.id, ids[0]);
+    let (one, other) = (submit(engine, of("one")).await, submit(engine, of("other")).await);
+    let names = |claims: &[Claim]| claims.iter().map(|claim| claim.tenant.name().to_owned()).collect::<Vec<_>>();
+    // neither waits behind the many, of which one runs already
+    let next = claim_tenants(engine, 2).await;
+    assert_eq!(next.iter().map(|claim| claim.id).collect::<Vec<_>>(), [one, other], "{:?}", names(&next));
+    // what comes back was first before
+    engine.finish(&running, Outcome::Released).await.expect("gives back");
+    cancel_all(engine, next).await;
+    // one slot: one after the other, whoever has more
+    for _ in 0..3 {
+        submit(engine, of("one")).await;
+    }
+    let mut order = Vec::new();
+    for _ in 0..6 {
+        let claims = claim_tenants(engine, 1).await;
+        order.extend(names(&claims));
+        cancel_all(engine, claims).await;
+    }
+    assert!(order.windows(2).all(|pair| pair[0] != pair[1]), "{order:?}");
+    // several slots at once are shared
+    for _ in 0..3 {
+        submit(engine, of("one")).await;
+    }
+    let claims = claim_tenants(engine, 4).await;
+    assert_eq!(claims.iter().filter(|claim| claim.tenant == tenant("one")).count(), 2, "{:?}", names(&claims));
+    cancel_all(engine, claims).await;
+    cancel_all(engine, claim_tenants(engine, 100).await).await;
+}
+
+async fn what_a_tenant_has_at_once_is_limited(engine: &Arc<dyn Engine>) {
+    let key = IdempotencyKey { key: "limited".to_owned(), fingerprint: "f".to_owned() };
+    let keyed = || NewJob { key: Some(key.clone()), ..of("jobs") };
+    submit(engine, keyed()).await;
+    submit(engine, of("jobs")).await;
+    let refused = engine.submit(of("jobs")).await.expect("answers");
+    let Submitted::OverQuota(over) = refused else { panic!("expected to be over a quota, found {refused:?}") };
+    assert_eq!((over.quota, over.limit, over.left, over.window), ("queued", 2, 0, None));
+    let again = engine.submit(keyed()).await.expect("answers");
+    assert!(matches!(again, Submitted::Replayed(_)), "what was accepted is answered: {again:?}");
+    submit(engine, of("free")).await;
+    let claims = claim_tenants(engine, 10).await;
+    let of_jobs = |claims: &[Claim]| claims.iter().filter(|claim| claim.tenant == tenant("jobs")).count();
+    assert_eq!((claims.len(), of_jobs(&claims)), (2, 1), "one at once, and others are not held up");
+    assert!(claim_tenants(engine, 10).await.is_empty());
+    submit(engine, of("jobs")).await;
+    cancel_all(engine, claims).await;
+    for _ in 0..2 {
+        let claims = claim_tenants(engine, 10).await;
+        assert_eq!(of_jobs(&claims), 1);
+        cancel_all(engine, claims).await;
+    }
+}
+
+async fn what_a_tenants_jobs_cost_is_limited(engine: &Arc<dyn Engine>) {
+    let over = async |new: NewJob| match engine.submit(new).await.expect("answers") {
+        Submitted::OverQuota(over) => over,
+        other => panic!("expected to be over a quota, found {other:?}"),
+    };
+    let expect = |over: Exceeded, quota, limit, left| {
+        assert_eq!((over.quota, over.limit, over.left, over.window), (quota, limit, left, Some(HOUR)));
+        assert!(over.retry_after > HOUR - 2 * PATIENCE && over.retry_after <= HOUR, "{over:?}");
+    };
+    let asking = |vertices| NewJob { vertices, ..of("vertices") };
+    let id = submit(engine, asking(60)).await;
+    expect(over(asking(41)).await, "vertices_per_hour", 100, 40);
+    submit(engine, asking(40)).await;
+    // what was asked for counts, also when it is forgotten
+    engine.request_cancel(&tenant("vertices"), id).await.expect("cancels");
+    assert_eq!(engine.forget(&tenant("vertices"), id).await.expect("forgets"), Forgotten::Gone(Vec::new()));
+    expect(over(asking(1)).await, "vertices_per_hour", 100, 0);
+    submit(engine, asking(0)).await;
+    cancel_all(engine, claim_tenants(engine, 10).await).await;
+
+    let id = submit(engine, of("seconds")).await;
+    let claim = claim_one(engine, "a").await;
+    assert_eq!(claim.id, id);
+    tokio::time::sleep(Duration::from_millis(20)).await;
+    // what runs counts once it stops
+    submit(engine, of("seconds")).await;
+    engine.finish(&claim, success("aa")).await.expect("finishes");
+    expect(over(of("seconds")).await, "seconds_per_hour", 1, 0);
+    cancel_all(engine, claim_tenants(engine, 10).await).await;
+}
+
+async fn a_full_queue_takes_no_more(engine: &Arc<dyn Engine>) {
+    let mut ids = Vec::new();
+    for i in 0..QUEUE {
+        ids.push((i, submit(engine, of(if i % 2 == 0 { "even" } else { "odd" })).await));
+    }
+    assert_eq!(engine.submit(of("even")).await.expect("answers"), Submitted::QueueFull);
+    assert_eq!(engine.submit(of("another")).await.expect("answers"), Submitted::QueueFull);
+    cancel_all(engine, claim_tenants(engine, 1).await).await;
+    submit(engine, of("another")).await;
+    cancel_all(engine, claim_tenants(engine, 100).await).await;
 }

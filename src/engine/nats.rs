@@ -7,6 +7,7 @@
 //! | promise | kept by |
 //! |---|---|
 //! | accepted jobs survive | the record is stored by a majority of the servers before `submit` returns; they must sync (`docker/nats.conf`) |
+//! | jobs run in their turn | every node knows the queue (`projection`) and takes the job whose turn it is (`claims`) |
 //! | one worker at a time | a claim is a compare-and-set from `queued` to `running` under the next attempt |
 //! | only the newest attempt counts | renewing and finishing look at the attempt in the version that they replace |
 //! | lost workers are found | every node watches heartbeats by its own clock (`leases`) |
@@ -15,7 +16,7 @@
 //! | an end is told | what is owed is stored with the end, in its record (`notices`) |
 //!
 //! Not guaranteed beyond what the [room](super) says: a list on one node shows what was submitted on another only once its
-//! feed has brought it, usually within milliseconds; and a job that comes back to the queue waits behind those that are there.
+//! feed has brought it, usually within milliseconds.
 //! Do not use it for a single machine: the embedded engine needs no servers and is faster.
 
 mod address;
@@ -30,7 +31,6 @@ mod ledger;
 mod link;
 mod notices;
 mod projection;
-mod queue;
 mod record;
 mod sweeper;
 #[cfg(test)]
@@ -51,7 +51,6 @@ use layout::{Layout, Name};
 use ledger::{Found, Ledger, Step, Version};
 use link::{Link, failed, patiently};
 use projection::Projection;
-use queue::Queue;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
@@ -61,8 +60,6 @@ use tokio::task::JoinHandle;
 const HEALTH: Duration = Duration::from_secs(2);
 /// How often a running job looks at its claim by itself; news wake it at once.
 const LOOK: Duration = Duration::from_secs(1);
-/// How long a call waits for the queue once the record is stored.
-const ENQUEUE: Duration = Duration::from_secs(2);
 /// How long forgetting waits for what other nodes stored before it; after that the blobs are kept.
 const FORGET: Duration = Duration::from_secs(2);
 /// Bytes of news that are stored together at most: well below the messages that servers take by default.
@@ -77,7 +74,6 @@ pub struct NatsEngine {
 /// What the engine's tasks share.
 struct Node {
     ledger: Arc<Ledger>,
-    queue: Queue,
     feed: Feed,
     terms: Terms,
 }
@@ -98,10 +94,9 @@ impl NatsEngine {
         }
         let link = Link::open(address).await?;
         let layout = patiently(Layout::open(&link, address)).await?;
-        let queue = patiently(Queue::open(link.clone(), layout.clone())).await?;
         let ledger = Arc::new(Ledger { link, layout, projection: Projection::open(folder)? });
         let feed = Feed::start(ledger.clone()).await?;
-        let node = Arc::new(Node { ledger, queue, feed, terms });
+        let node = Arc::new(Node { ledger, feed, terms });
         let tasks = [
             tokio::spawn(sweeper::run(Arc::downgrade(&node))),
             tokio::spawn(housekeeping::run(Arc::downgrade(&node.ledger))),
@@ -123,21 +118,15 @@ impl Node {
     }
 
     async fn submit(&self, new: NewJob) -> Result<Submitted, EngineError> {
-        let tenant = new.tenant.clone();
-        let submitted = keys::submit(&self.ledger, new).await?;
-        if let Submitted::Created(job) = &submitted {
-            self.enqueue(&Name::new(&tenant, job.id)).await;
+        if let Some(refused) = self.ledger.projection.refuse(new.clone(), &self.terms).await? {
+            // what was accepted before is answered in any case
+            let known = match &new.key {
+                Some(key) => keys::recall(&self.ledger, &new.tenant, key).await?,
+                None => None,
+            };
+            return Ok(known.unwrap_or(refused));
         }
-        Ok(submitted)
-    }
-
-    /// Puts a job that waits into the queue. Where that fails a sweeper will do it, and the change that made it wait stands.
-    async fn enqueue(&self, name: &Name) {
-        let pushed = tokio::time::timeout(ENQUEUE, self.queue.push(name)).await;
-        let pushed = pushed.unwrap_or_else(|_| Err(EngineError::Store("no answer in time".to_owned())));
-        if let Err(error) = pushed {
-            tracing::warn!(job.id = %name.id, %error, "a job that waits could not be put into the queue yet");
-        }
+        keys::submit(&self.ledger, new).await
     }
 
     async fn request_cancel(&self, name: &Name) -> Result<Option<Job>, EngineError> {
@@ -222,12 +211,7 @@ impl Node {
             Step::Write(true)
         });
         match ended.await? {
-            Some((true, record)) => {
-                if record.job.state == State::Queued {
-                    self.enqueue(&name).await;
-                }
-                Ok(())
-            }
+            Some((true, _)) => Ok(()),
             _ => Err(EngineError::Fenced { id: claim.id, attempt: claim.attempt }),
         }
     }

@@ -8,6 +8,7 @@ pub(super) mod notices;
 mod readers;
 pub(super) mod records;
 pub(super) mod schema;
+pub(super) mod shares;
 pub(super) mod writer;
 
 pub(super) use readers::Readers;
@@ -107,7 +108,8 @@ impl From<rusqlite::Error> for EngineError {
 #[async_trait::async_trait]
 impl Engine for SqliteEngine {
     async fn submit(&self, new: NewJob) -> Result<Submitted, EngineError> {
-        let submitted = self.write(move |ctx| submit(ctx, &new)).await?;
+        let terms = self.terms.clone();
+        let submitted = self.write(move |ctx| submit(ctx, &new, &terms)).await?;
         if matches!(submitted, Submitted::Created(_)) {
             self.queued.notify_one();
         }
@@ -184,8 +186,8 @@ impl Engine for SqliteEngine {
     async fn claim(&self, worker: &str, slots: usize, wait: Duration) -> Result<Vec<Claim>, EngineError> {
         let deadline = tokio::time::Instant::now() + wait;
         loop {
-            let (worker, terms) = (worker.to_owned(), self.terms);
-            let claims = self.write(move |ctx| claim(ctx, &worker, slots, terms)).await?;
+            let (worker, terms) = (worker.to_owned(), self.terms.clone());
+            let claims = self.write(move |ctx| claim(ctx, &worker, slots, &terms)).await?;
             let now = tokio::time::Instant::now();
             if !claims.is_empty() || now >= deadline {
                 return Ok(claims);
@@ -320,11 +322,15 @@ fn recall(ctx: &mut Ctx<'_>, tenant: &Tenant, key: &IdempotencyKey) -> rusqlite:
     Ok(Some(Submitted::Replayed(records::from_json(&answer)?)))
 }
 
-fn submit(ctx: &mut Ctx<'_>, new: &NewJob) -> rusqlite::Result<Submitted> {
+fn submit(ctx: &mut Ctx<'_>, new: &NewJob, terms: &Terms) -> rusqlite::Result<Submitted> {
     if let Some(key) = &new.key
         && let Some(answer) = recall(ctx, &new.tenant, key)?
     {
         return Ok(answer);
+    }
+    shares::drop_old(ctx.connection, ctx.now)?;
+    if let Some(refused) = shares::refuse(ctx.connection, ctx.now, new, terms)? {
+        return Ok(refused);
     }
     records::insert(ctx, new)?;
     let job = records::read(ctx.connection, &new.tenant, new.id)?.ok_or(rusqlite::Error::QueryReturnedNoRows)?;
@@ -337,36 +343,50 @@ fn submit(ctx: &mut Ctx<'_>, new: &NewJob) -> rusqlite::Result<Submitted> {
     Ok(Submitted::Created(job))
 }
 
-fn claim(ctx: &mut Ctx<'_>, worker: &str, slots: usize, terms: Terms) -> rusqlite::Result<Vec<Claim>> {
+fn claim(ctx: &mut Ctx<'_>, worker: &str, slots: usize, terms: &Terms) -> rusqlite::Result<Vec<Claim>> {
     let lost = records::requeue_lost(ctx, ctx.now, terms.max_losses)?;
     metrics::attempts_lost(lost as u64);
     let mut claims = Vec::new();
-    while claims.len() < slots {
-        let until = ctx.now.saturating_add(terms.lease.as_millis() as i64);
-        let take = "UPDATE jobs SET state = 'running', attempt = attempt + 1, revision = revision + 1, worker = ?1,
-                        lease_until = ?2, started_at = COALESCE(started_at, ?3), progress = NULL
-                    WHERE id = (SELECT id FROM jobs WHERE state = 'queued' ORDER BY id LIMIT 1)
-                    RETURNING id, attempt, spec, tenant";
-        let taken = ctx.connection.query_row(take, params![worker, until, ctx.now], |row| {
-            Ok((row.get::<_, String>(0)?, row.get::<_, u32>(1)?, row.get::<_, String>(2)?, row.get::<_, String>(3)?))
-        });
-        let Some((id, attempt, spec, tenant)) = taken.optional()? else { break };
-        let id: JobId = id.parse().map_err(records::corrupt)?;
-        let tenant: Tenant = tenant.parse().map_err(records::corrupt)?;
-        let spec: serde_json::Value = records::from_json(&spec)?;
-        match JobSpec::from_stored(spec) {
-            Ok(spec) => {
-                records::tell_state(ctx, id)?;
-                claims.push(Claim { tenant, id, attempt, spec, worker: worker.to_owned(), lease: terms.lease });
-            }
-            // accepted by another version that knew more
-            Err(faults) => {
-                tracing::error!(job.id = %id, ?faults, "the stored request cannot be read");
-                records::change(ctx, id, Change { problem: Some(Failure::internal()), ..Change::to(State::Failed) })?;
-            }
+    loop {
+        let turns = shares::next(ctx.connection, slots - claims.len(), terms)?;
+        if turns.is_empty() {
+            return Ok(claims);
+        }
+        for (tenant, id) in turns {
+            claims.extend(take_up(ctx, tenant, id, worker, terms.lease)?);
         }
     }
-    Ok(claims)
+}
+
+/// Claims a job that waits; one whose request cannot be read fails.
+fn take_up(
+    ctx: &mut Ctx<'_>,
+    tenant: Tenant,
+    id: JobId,
+    worker: &str,
+    lease: Duration,
+) -> rusqlite::Result<Option<Claim>> {
+    let until = ctx.now.saturating_add(lease.as_millis() as i64);
+    let take = "UPDATE jobs SET state = 'running', attempt = attempt + 1, revision = revision + 1, worker = ?2,
+                    lease_until = ?3, started_at = COALESCE(started_at, ?4), claimed_at = ?4, progress = NULL
+                WHERE id = ?1 RETURNING attempt, spec";
+    let (attempt, spec): (u32, String) = ctx
+        .connection
+        .prepare_cached(take)?
+        .query_row(params![id.to_string(), worker, until, ctx.now], |row| Ok((row.get(0)?, row.get(1)?)))?;
+    let spec: serde_json::Value = records::from_json(&spec)?;
+    match JobSpec::from_stored(spec) {
+        Ok(spec) => {
+            records::tell_state(ctx, id)?;
+            Ok(Some(Claim { tenant, id, attempt, spec, worker: worker.to_owned(), lease }))
+        }
+        // accepted by another version that knew more
+        Err(faults) => {
+            tracing::error!(job.id = %id, ?faults, "the stored request cannot be read");
+            records::change(ctx, id, Change { problem: Some(Failure::internal()), ..Change::to(State::Failed) })?;
+            Ok(None)
+        }
+    }
 }
 
 #[cfg(test)]
@@ -381,8 +401,7 @@ mod tests {
     #[tokio::test]
     async fn keeps_every_promise_of_an_engine() {
         let folder = tempfile::tempdir().expect("folder");
-        let lease = conformance::LEASE;
-        let engine = open(folder.path(), Terms { lease, max_losses: 2 });
+        let engine = open(folder.path(), conformance::terms());
         conformance::run(Arc::new(engine)).await;
     }
 

@@ -8,6 +8,7 @@
 //! proxies too, and a form would be sent from other sites.
 
 use super::Problem;
+use super::rates::{Rate, Rates};
 use crate::auth::{Authenticator, Caller, NotAllowed, Refused};
 use axum::extract::{FromRequestParts, Request, State};
 use axum::http::request::Parts;
@@ -48,22 +49,35 @@ impl Problem {
     }
 }
 
-/// Puts the [`Caller`] into the request, or refuses it. Without an authenticator everybody may do everything.
-pub async fn identify(
-    State(authenticator): State<Option<Arc<Authenticator>>>,
-    mut request: Request,
-    next: Next,
-) -> Response {
+/// Whom the service lets in, and how often.
+#[derive(Clone)]
+pub struct Door {
+    /// Tells who asks; where there is none everybody may do everything.
+    pub authenticator: Option<Arc<Authenticator>>,
+    /// How often each tenant may.
+    pub rates: Arc<Rates>,
+}
+
+/// Puts the [`Caller`] into the request, or refuses it; so it does when the caller's tenant asks too often.
+pub async fn identify(State(door): State<Door>, mut request: Request, next: Next) -> Response {
     // nothing from outside brings extensions along: one that is there was put there by this program
     if request.extensions().get::<Caller>().is_none() && !OPEN.contains(&request.uri().path()) {
-        let caller = match &authenticator {
+        let caller = match &door.authenticator {
             None => Caller::anybody(),
             Some(authenticator) => match ask(authenticator, request.headers()).await {
                 Ok(caller) => caller,
                 Err(problem) => return problem.into_response(),
             },
         };
+        let standing = match door.rates.take(caller.whose(), Rate::Requests, 1) {
+            Ok(standing) => standing,
+            Err(problem) => return problem.into_response(),
+        };
         request.extensions_mut().insert(caller);
+        let mut response = next.run(request).await;
+        // an answer that tells of another quota keeps it beside this one
+        standing.inspect(|standing| standing.tell(response.headers_mut()));
+        return response;
     }
     next.run(request).await
 }

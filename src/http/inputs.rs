@@ -1,5 +1,6 @@
 //! `/v1/inputs`: bytes that jobs name by their hash.
 
+use super::rates::Rate;
 use super::{App, Problem, body, query};
 use crate::auth::{Caller, Scope};
 use crate::blobs::BlobId;
@@ -94,6 +95,7 @@ fn says_nothing(options: &FieldOptions) -> bool {
         (status = 400, description = "a query parameter is unknown or does not fit the file, or the body broke off"),
         (status = 413, description = "the file is too large"),
         (status = 422, description = "the file cannot be read as a field"),
+        (status = 429, description = "a quota is used up"),
         (status = 503, description = "the service is stopping"),
     )
 )]
@@ -126,6 +128,7 @@ pub(crate) enum Stored {
 
 /// Checks a file and stores it, with what it is when it is read as `options` say.
 pub(crate) async fn store(app: &App, tenant: &Tenant, bytes: Bytes, options: FieldOptions) -> Result<Stored, Problem> {
+    app.rates.take(tenant, Rate::UploadedBytes, bytes.len() as u64)?;
     metrics::uploaded(bytes.len() as u64);
     let hashed = bytes.clone();
     let id = tokio::task::spawn_blocking(move || BlobId::of(&hashed)).await.map_err(joined)?;

@@ -73,7 +73,11 @@ pub struct Estimate {
         (status = 413, description = "the body is too large"),
         (status = 415, description = "the body is not application/json"),
         (status = 422, description = "the request is wrong, or its key was used for another request"),
-        (status = 503, description = "the service is stopping"),
+        (status = 429, description = "a quota is used up", headers(
+            ("Retry-After", description = "seconds after which there may be more"),
+            ("RateLimit", description = "the quota, and what is left of it"),
+            ("RateLimit-Policy", description = "the quota, how much it is, and over how many seconds"))),
+        (status = 503, description = "the queue is full, or the service is stopping"),
     )
 )]
 pub async fn submit(
@@ -131,11 +135,13 @@ pub(crate) async fn accept(
     }
     // no blob goes from the moment that it is looked up until the new job's record names it
     let promise = app.blobs.promise().await;
-    let (spec, _) = look_up(app, tenant, spec, request).await?;
+    let (spec, dimension) = look_up(app, tenant, spec, request).await?;
     if app.stop.is_cancelled() {
         return Err(Problem::unavailable("stopping", "the service is stopping"));
     }
-    let submitted = app.engine.submit(NewJob { tenant: tenant.clone(), id: JobId::new(), spec, key }).await?;
+    let vertices = estimate(&spec, dimension).vertices;
+    let new = NewJob { tenant: tenant.clone(), id: JobId::new(), spec, vertices, key };
+    let submitted = app.engine.submit(new).await?;
     drop(promise);
     tell_accepted(&submitted, clock);
     accepted(submitted)
@@ -150,7 +156,7 @@ fn tell_accepted(submitted: &Submitted, since: Instant) {
 
 /// Reads a request for a job; what it names is not looked up yet.
 fn read(app: &App, request: &Value) -> Result<JobSpec, Problem> {
-    let spec = JobSpec::from_value(request).map_err(|faults| Problem::invalid_request("", &faults))?;
+    let mut spec = JobSpec::from_value(request).map_err(|faults| Problem::invalid_request("", &faults))?;
     if spec.work.kind() == JobKind::Sensitivity {
         let detail = "a sensitivity is asked for by POST /v1/jobs/{id}/sensitivity".to_owned();
         let fault = Fault { pointer: "/kind".to_owned(), code: "not_offered", detail };
@@ -159,6 +165,13 @@ fn read(app: &App, request: &Value) -> Result<JobSpec, Problem> {
     if let Some(webhook) = &spec.webhook {
         check_webhook(app.webhooks.as_ref(), &webhook.url)?;
     }
+    let longest = app.limits.job_seconds;
+    if spec.deadline_s.is_some_and(|seconds| seconds > longest) {
+        let detail = format!("a job runs for {longest} s at most here");
+        let fault = Fault { pointer: "/deadline_s".to_owned(), code: "out_of_range", detail };
+        return Err(Problem::invalid_request("", &[fault]));
+    }
+    spec.deadline_s.get_or_insert(longest);
     Ok(spec)
 }
 
@@ -201,6 +214,10 @@ fn accepted(submitted: Submitted) -> Result<Accepted, Problem> {
         Submitted::InFlight => {
             let detail = "a request with the same key is being worked on";
             return Err(Problem::conflict("idempotency_key_in_flight", "the key is in use", detail).retry_after(1));
+        }
+        Submitted::OverQuota(over) => return Err(Problem::over_quota(over)),
+        Submitted::QueueFull => {
+            return Err(Problem::unavailable("queue_full", "as many jobs wait as may, of all tenants together"));
         }
     };
     tracing::info!(job.id = %job.id, replayed, "job submitted");
@@ -580,6 +597,10 @@ pub struct FitRequest {
     /// Who is told of the end.
     #[schema(required = false)]
     webhook: Option<WebhookSpec>,
+    /// Seconds that an attempt may run, from its start: then it is stopped, and the job has failed. The service's own limit when nothing is
+    /// said; no more than that.
+    #[schema(required = false, minimum = 1)]
+    deadline_s: Option<u32>,
 }
 
 /// A request for a surface: only the field is required. [`JobSpec`] is the same with every default filled in.
@@ -616,4 +637,8 @@ pub struct ShrinkRequest {
     /// Who is told of the end.
     #[schema(required = false)]
     webhook: Option<WebhookSpec>,
+    /// Seconds that an attempt may run, from its start: then it is stopped, and the job has failed. The service's own limit when nothing is
+    /// said; no more than that.
+    #[schema(required = false, minimum = 1)]
+    deadline_s: Option<u32>,
 }

@@ -144,7 +144,10 @@ mod tests {
             blobs.put_note(&own, input, Bytes::from_static(b"{}")).await.expect("notes");
         }
         let spec = JobSpec::from_value(&json!({"field": {"input": named.to_string()}})).expect("a request");
-        engine.submit(NewJob { tenant: own.clone(), id: JobId::new(), spec, key: None }).await.expect("submits");
+        engine
+            .submit(NewJob { tenant: own.clone(), id: JobId::new(), spec, vertices: 0, key: None })
+            .await
+            .expect("submits");
         let claim = engine.claim("a", 1, Duration::ZERO).await.expect("claims").remove(0);
         let made = Output {
             name: "glb".to_owned(),

@@ -4,6 +4,7 @@ use crate::field::{Fault, FieldError};
 use crate::measure::Verdict;
 use crate::shrink::ShrinkError;
 use serde::{Deserialize, Serialize};
+use std::time::Duration;
 
 /// Prefix of every problem type: `urn:shrinkd:problem:` and the code.
 pub const TYPE_PREFIX: &str = "urn:shrinkd:problem:";
@@ -75,6 +76,23 @@ impl Failure {
     pub fn attempts_exhausted(attempts: u32) -> Self {
         let detail = format!("{attempts} workers took this job up and none brought it to an end");
         Self::new("attempts_exhausted", "every attempt was lost", detail)
+    }
+
+    /// The attempt ran for as long as it may.
+    pub fn deadline_exceeded(allowed: Duration) -> Self {
+        let detail = format!("the job did not come to its end within {} s", allowed.as_secs());
+        Self::new("deadline_exceeded", "the job ran for too long", detail)
+    }
+
+    /// The job needs more memory than there is.
+    pub fn memory_exceeded(needed: u64, limit: u64) -> Self {
+        let mib = |bytes: u64| bytes.div_ceil(1 << 20);
+        let detail = format!(
+            "the job is estimated to need {} MiB of memory, and {} MiB may be used: ask for fewer vertices, or a smaller input",
+            mib(needed),
+            mib(limit)
+        );
+        Self::new("memory_exceeded", "the job needs too much memory", detail)
     }
 
     /// Whether the input is at fault (and not the shape it describes).

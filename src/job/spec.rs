@@ -188,6 +188,9 @@ pub struct JobSpec {
     /// Who is told of the end.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub webhook: Option<WebhookSpec>,
+    /// Seconds that an attempt may run before it is stopped and the job has failed; the service's limit when nothing is said.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub deadline_s: Option<u32>,
 }
 
 /// Who is told of the end of a job.

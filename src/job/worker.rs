@@ -64,6 +64,8 @@ pub struct Worker {
     pub pool: Arc<rayon::ThreadPool>,
     /// Jobs at once.
     pub slots: usize,
+    /// Seconds that an attempt may run whose job does not say.
+    pub job_seconds: u32,
     /// Name of this worker, different for every process.
     pub name: String,
 }
@@ -144,7 +146,10 @@ impl Worker {
         tokio::pin!(interrupted);
         let beat = claim.lease / 3;
         let mut heartbeat = tokio::time::interval_at(tokio::time::Instant::now() + beat, beat);
-        let (mut lost, mut watching, mut returning) = (false, true, false);
+        let (mut lost, mut watching, mut returning, mut late) = (false, true, false, None);
+        let allowed = Duration::from_secs(claim.spec.deadline_s.unwrap_or(self.job_seconds).into());
+        let deadline = tokio::time::sleep(allowed);
+        tokio::pin!(deadline);
         let result = loop {
             tokio::select! {
                 // what was told before the end is stored before the end
@@ -166,6 +171,11 @@ impl Worker {
                     returning = true;
                     cancel.cancel();
                 }
+                () = &mut deadline, if late.is_none() => {
+                    // what was to be stopped before has not failed
+                    late = Some(!cancel.is_canceled());
+                    cancel.cancel();
+                }
                 _ = heartbeat.tick() => lost |= self.renew(&claim, Vec::new()).await == Renewal::Lost,
             }
             if lost {
@@ -185,6 +195,9 @@ impl Worker {
         let outcome = match result {
             Ok(made) => self.renewing(&claim, &mut heartbeat, self.store(&claim, made)).await,
             Err(Unfinished::Ended(Ended::Failed(failure))) => Some(Outcome::failed(*failure)),
+            Err(Unfinished::Ended(Ended::Canceled)) if late == Some(true) => {
+                Some(Outcome::failed(Failure::deadline_exceeded(allowed)))
+            }
             Err(Unfinished::Ended(Ended::Canceled)) if returning => Some(Outcome::Released),
             Err(Unfinished::Ended(Ended::Canceled)) => Some(Outcome::Canceled),
             Err(Unfinished::OutOfReach) => None,

@@ -13,7 +13,11 @@ pub async fn follow(app: &App, id: &str, last_seen: Option<u64>) -> Vec<(u64, St
     if let Some(last) = last_seen {
         request = request.header("last-event-id", last.to_string());
     }
-    let response = request.send().await.expect("an answer");
+    frames(request.send().await.expect("an answer")).await
+}
+
+/// The events of a stream until it ends: number, kind, body.
+pub async fn frames(response: reqwest::Response) -> Vec<(u64, String, Value)> {
     assert_eq!(response.status(), StatusCode::OK);
     assert_eq!(response.headers()["content-type"], "text/event-stream");
     let mut stream = response.bytes_stream().eventsource();

@@ -1,14 +1,15 @@
 //! How a worker comes to a job.
 //!
-//! An id is taken from the queue, the record is moved to `running` under the next attempt, and then the id is settled. Should
-//! the node die before the record is moved, the id comes back to the queue; should it die after that, the job has a hold
-//! whose lease runs out.
+//! There is no queue but the records: every node knows which jobs wait, takes the one whose turn it is, and moves its record to
+//! `running` under the next attempt. That is a compare-and-set, so of several nodes that try one succeeds, and the others find
+//! that out and take the next. (The plan had a work queue of its own beside the records; a queue that hands out ids in the order
+//! in which they came cannot give tenants their turns.)
 
 use super::Node;
-use super::layout::{HANDOVER, Name};
+use super::layout::Name;
 use super::ledger::{Found, Step};
-use super::link::patiently;
-use super::queue::Ticket;
+use super::link::{failed, patiently};
+use super::sweeper::jittered;
 use crate::engine::{Claim, EngineError, Outcome};
 use crate::job::{Failure, JobSpec, State};
 use std::sync::Arc;
@@ -16,6 +17,11 @@ use std::time::Duration;
 use tokio::sync::oneshot;
 use tokio::time::Instant;
 use tracing::{error, warn};
+
+/// Pause after other nodes were faster with everything whose turn it was.
+const PAUSE: Duration = Duration::from_millis(10);
+/// How often the queue is looked at without news: somebody's limit of jobs at once may have been freed.
+const LOOK: Duration = Duration::from_secs(1);
 
 /// Takes up to `slots` jobs, waiting at most `wait` for the first. Whoever asked may go away: what was claimed for nobody is
 /// given back, and no loss is counted.
@@ -49,43 +55,41 @@ async fn wait_for(
     let deadline = Instant::now() + wait;
     let mut claims = Vec::new();
     while claims.len() < slots {
-        let mut tickets = match patiently(node.queue.waiting(slots - claims.len())).await {
-            Ok(tickets) => tickets,
-            // what was claimed so far is claimed
-            Err(_) if !claims.is_empty() => break,
-            Err(error) => {
-                patiently(node.queue.mend()).await?;
-                return Err(error);
-            }
-        };
-        if tickets.is_empty() {
-            let left = deadline.saturating_duration_since(Instant::now());
-            if !claims.is_empty() || left.is_zero() {
+        // listened to before looking, so that nothing falls between
+        let queued = node.ledger.projection.queued.notified();
+        let turns = node.ledger.projection.next(slots - claims.len(), &node.terms).await?;
+        if turns.is_empty() {
+            let now = Instant::now();
+            if !claims.is_empty() || now >= deadline {
                 break;
             }
-            tickets = tokio::select! {
+            tokio::select! {
                 () = answer.closed() => break,
-                came = node.queue.next(left) => came?,
-            };
+                () = queued => {}
+                () = tokio::time::sleep_until(deadline.min(now + LOOK)) => {}
+            }
+            continue;
         }
-        let taken = futures::future::join_all(tickets.iter().map(|ticket| claim(node, ticket, worker))).await;
-        for (ticket, taken) in tickets.iter().zip(taken) {
+        let taken = futures::future::join_all(turns.iter().map(|name| patiently(take_up(node, name, worker)))).await;
+        let (before, mut failed) = (claims.len(), None);
+        for (name, taken) in turns.iter().zip(taken) {
             match taken {
                 Ok(claim) => claims.extend(claim),
                 Err(error) => {
-                    // the id comes back to the queue
-                    warn!(job.id = %ticket.name.id, handover_s = HANDOVER.as_secs(), %error, "a job could not be claimed");
+                    warn!(job.id = %name.id, %error, "a job could not be claimed");
+                    failed = Some(error);
                 }
             }
         }
+        match failed {
+            // what was claimed so far is claimed
+            Some(_) if !claims.is_empty() => break,
+            Some(error) => return Err(error),
+            None if claims.len() == before => tokio::time::sleep(jittered(PAUSE)).await,
+            None => {}
+        }
     }
     Ok(claims)
-}
-
-async fn claim(node: &Node, ticket: &Ticket, worker: &str) -> Result<Option<Claim>, EngineError> {
-    let claimed = patiently(take_up(node, &ticket.name, worker)).await?;
-    ticket.settle().await;
-    Ok(claimed)
 }
 
 /// Moves the record, if the job waits; `None` when it does not.
@@ -96,6 +100,7 @@ async fn take_up(node: &Node, name: &Name, worker: &str) -> Result<Option<Claim>
         Some(version) => version,
         None => match node.ledger.read(name).await? {
             Found::Job(version) if waits(version.record.job.state) => version,
+            Found::Nothing => return drop_removed(node, name).await.map(|()| None),
             _ => return Ok(None),
         },
     };
@@ -110,7 +115,11 @@ async fn take_up(node: &Node, name: &Name, worker: &str) -> Result<Option<Claim>
             Step::Leave(false)
         }
     });
-    let Some((true, record)) = taken.await? else { return Ok(None) };
+    let record = match taken.await? {
+        Some((true, record)) => record,
+        Some((false, _)) => return Ok(None),
+        None => return drop_removed(node, name).await.map(|()| None),
+    };
     let (Name { tenant, id }, attempt) = (name.clone(), record.job.attempt);
     match request.map(JobSpec::from_stored) {
         Some(Ok(spec)) => Ok(Some(Claim { tenant, id, attempt, spec, worker: worker.to_owned(), lease })),
@@ -126,6 +135,21 @@ async fn take_up(node: &Node, name: &Name, worker: &str) -> Result<Option<Claim>
             });
             failed.await?;
             Ok(None)
+        }
+    }
+}
+
+/// Forgets a job whose messages somebody has removed from the stream, so that it holds nobody up. A leader that has not come to them yet
+/// does not count.
+async fn drop_removed(node: &Node, name: &Name) -> Result<(), EngineError> {
+    let info = node.ledger.layout.jobs.get_info().await.map_err(|e| failed("the jobs")(e.into()))?;
+    match node.ledger.projection.seen(name.id) {
+        Some(version) if version.seq > info.state.last_sequence => {
+            Err(EngineError::Store("the stream's leader is behind".to_owned()))
+        }
+        _ => {
+            warn!(job.id = %name.id, "somebody has removed the record of a job that waits");
+            node.ledger.projection.drop_removed(name.id).await
         }
     }
 }

@@ -22,8 +22,7 @@ pub(super) struct Used {
     job: Job,
 }
 
-/// Makes the job of a submit, or finds the one that its key stands for. The caller puts what is [`Submitted::Created`] into
-/// the queue.
+/// Makes the job of a submit, or finds the one that its key stands for.
 pub(super) async fn submit(ledger: &Ledger, mut new: NewJob) -> Result<Submitted, EngineError> {
     let mut created_at = now();
     if let Some(key) = new.key.clone() {

@@ -5,7 +5,6 @@
 //! | `SHRINKD_JOBS` | `SHRINKD.job.{tenant}.{id}` | entries of a job: the newest is its record, the older ones its events |
 //! | `SHRINKD_SPECS` | `SHRINKD.spec.{tenant}.{id}` | the request, once; apart, because it may be large and never changes |
 //! | `SHRINKD_KEYS` | `SHRINKD.key.{tenant}.{hash}` | idempotency keys, for 24 hours |
-//! | `SHRINKD_WORK` | `SHRINKD.work.{tenant}.{id}` | ids of jobs that wait for a worker; a work queue |
 //!
 //! The tenant is part of the subject, so that what another tenant has is asked for where nothing is. The default tenant's subjects
 //! leave it out, as all did before there were tenants.
@@ -15,8 +14,7 @@ use super::link::{Link, failed};
 use crate::engine::EngineError;
 use crate::job::JobId;
 use crate::tenant::Tenant;
-use async_nats::jetstream::consumer::{AckPolicy, PullConsumer, pull};
-use async_nats::jetstream::stream::{Config, DiscardPolicy, RetentionPolicy, StorageType, Stream};
+use async_nats::jetstream::stream::{Config, DiscardPolicy, StorageType, Stream};
 use sha2::{Digest, Sha256};
 use std::time::Duration;
 use tracing::warn;
@@ -25,15 +23,8 @@ use tracing::warn;
 const KEPT_ENTRIES: i64 = 512;
 /// How long an idempotency key is kept.
 pub(super) const KEY_LIFETIME: Duration = Duration::from_secs(24 * 60 * 60);
-/// How long the servers remember the ids of messages, so that an id put into the queue twice is there once.
+/// How long the servers remember the ids of messages.
 const REPETITIONS: Duration = Duration::from_secs(60);
-/// How long a claimed id may wait for its record to be changed before another worker gets it. It is no lease: the id is gone
-/// from the queue as soon as the record says who runs the job.
-pub(super) const HANDOVER: Duration = Duration::from_secs(10);
-/// Workers that wait for a job at once, over all nodes.
-const WAITING: i64 = 8192;
-/// The one consumer of the queue, which all workers share.
-const WORKERS: &str = "workers";
 
 /// What stands for a dot of a tenant's name in a subject, where dots separate. No name holds it.
 const DOT: &str = "=";
@@ -57,7 +48,6 @@ pub(super) struct Layout {
     pub jobs: Stream<()>,
     pub specs: Stream<()>,
     pub keys: Stream<()>,
-    pub work: Stream<()>,
     prefix: String,
 }
 
@@ -80,12 +70,10 @@ impl Layout {
         };
         let jobs = Config { max_messages_per_subject: KEPT_ENTRIES, allow_rollup: true, ..base("JOBS", "job") };
         let keys = Config { max_age: KEY_LIFETIME, ..base("KEYS", "key") };
-        let work = Config { retention: RetentionPolicy::WorkQueue, ..base("WORK", "work") };
         Ok(Self {
             jobs: open(link, jobs).await?,
             specs: open(link, base("SPECS", "spec")).await?,
             keys: open(link, keys).await?,
-            work: open(link, work).await?,
             prefix: prefix.clone(),
         })
     }
@@ -110,14 +98,6 @@ impl Layout {
         format!("{}.spec.>", self.prefix)
     }
 
-    pub(super) fn work(&self, name: &Name) -> String {
-        self.subject("work", &name.tenant, name.id)
-    }
-
-    pub(super) fn every_work(&self) -> String {
-        format!("{}.work.>", self.prefix)
-    }
-
     /// A client chooses its keys freely, and a subject cannot hold every text.
     pub(super) fn key(&self, tenant: &Tenant, key: &str) -> String {
         let hash: String = Sha256::digest(key.as_bytes()).iter().map(|byte| format!("{byte:02x}")).collect();
@@ -133,21 +113,6 @@ impl Layout {
             _ => return None,
         };
         Some(Name { tenant, id: id.parse().ok()? })
-    }
-
-    /// The queue's consumer, made when it is not there.
-    pub(super) async fn workers(&self) -> Result<PullConsumer, EngineError> {
-        let config = pull::Config {
-            durable_name: Some(WORKERS.to_owned()),
-            ack_policy: AckPolicy::Explicit,
-            ack_wait: HANDOVER,
-            // an id is handed over for as long as its job waits; what a job does to its workers is counted in its record
-            max_deliver: -1,
-            max_ack_pending: -1,
-            max_waiting: WAITING,
-            ..pull::Config::default()
-        };
-        self.work.get_or_create_consumer(WORKERS, config).await.map_err(|e| failed("the queue's consumer")(e.into()))
     }
 }
 

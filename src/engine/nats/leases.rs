@@ -13,7 +13,6 @@ use super::link::{Expect, patiently};
 use super::projection::Seen;
 use super::record::{Draft, Record};
 use crate::engine::EngineError;
-use crate::job::State;
 use crate::telemetry::metrics;
 
 /// Takes the jobs from workers that were not heard of for the time of their lease.
@@ -40,8 +39,5 @@ async fn take(node: &Node, seen: &Seen) -> Result<(), EngineError> {
     };
     metrics::attempts_lost(1);
     tracing::warn!(job.id = %name.id, losses = record.losses, "a worker was lost");
-    if record.job.state == State::Queued {
-        node.enqueue(&name).await;
-    }
     Ok(())
 }

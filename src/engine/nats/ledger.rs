@@ -143,7 +143,8 @@ impl Ledger {
 
     /// Puts a tombstone in the place of an ended job's entries, if `from` is still its newest. The number of the tombstone.
     pub(super) async fn forget(&self, name: &Name, from: &Version) -> Result<Option<u64>, EngineError> {
-        let entry = Entry::Forgotten { at: now() };
+        let entry =
+            Entry::Forgotten { at: now(), accepted_at: Some(from.record.job.created_at), cost: from.record.cost };
         let payload = entry.write().map_err(|e| failed("a record")(e.into()))?;
         let Store::Done(seq) =
             self.link.store(&self.layout.jobs, self.layout.job(name), payload, Expect::Replace(from.seq)).await?

@@ -13,9 +13,9 @@ use super::ledger::Version;
 use super::record::{Entry, Record};
 use crate::engine::sqlite::records::{self, Ctx, KEPT_EVENTS};
 use crate::engine::sqlite::writer::{Hub, Writer};
-use crate::engine::sqlite::{Readers, notices, schema};
-use crate::engine::{Counts, EngineError, EventPage, ListQuery, Page};
-use crate::job::{Event, JobId};
+use crate::engine::sqlite::{Readers, notices, schema, shares};
+use crate::engine::{Counts, EngineError, EventPage, ListQuery, NewJob, Page, Submitted, Terms};
+use crate::job::{Event, JobId, State};
 use crate::tenant::Tenant;
 use jiff::Timestamp;
 use rusqlite::{Connection, OptionalExtension, params};
@@ -24,7 +24,7 @@ use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
-use tokio::sync::broadcast;
+use tokio::sync::{Notify, broadcast};
 
 /// Which entry of a job is projected, and whether its events go back as far as the stream's do.
 const TABLE: &str = "
@@ -53,6 +53,8 @@ pub(super) struct Projection {
     readers: Readers,
     hub: Arc<Hub>,
     open: Open,
+    /// Told when a job came that waits.
+    pub queued: Notify,
     _lock: File,
 }
 
@@ -65,19 +67,50 @@ impl Projection {
         connection.execute_batch(TABLE)?;
         let hub = Arc::new(Hub::default());
         let writer = Writer::start(connection, hub.clone())?;
-        Ok(Self { writer, readers: Readers::new(path, connect), hub, open: Open::default(), _lock: lock })
+        let (readers, queued) = (Readers::new(path, connect), Notify::new());
+        Ok(Self { writer, readers, hub, open: Open::default(), queued, _lock: lock })
     }
 
     /// Takes entries in, with their numbers in the stream.
     pub(super) async fn apply(&self, entries: Vec<(u64, Name, Entry)>) -> Result<(), EngineError> {
         let open = self.open.clone();
+        let is_queued =
+            |entry: &Entry| matches!(entry, Entry::Changed { record, .. } if record.job.state == State::Queued);
+        let queued = entries.iter().any(|(_, _, entry)| is_queued(entry));
         let applied = self.writer.run(move |ctx| {
             for (seq, name, entry) in entries {
                 apply(ctx, &open, seq, name, entry)?;
             }
             Ok(())
         });
-        applied.await
+        applied.await?;
+        if queued {
+            self.queued.notify_waiters();
+        }
+        Ok(())
+    }
+
+    /// The jobs whose turn it is, at most `slots`.
+    pub(super) async fn next(&self, slots: usize, terms: &Terms) -> Result<Vec<Name>, EngineError> {
+        let terms = terms.clone();
+        let turns = self.readers.run(move |c| shares::next(c, slots, &terms)).await?;
+        Ok(turns.into_iter().map(|(tenant, id)| Name { tenant, id }).collect())
+    }
+
+    /// Why there is no room for a job, as far as this node knows; `None` when there is.
+    pub(super) async fn refuse(&self, new: NewJob, terms: &Terms) -> Result<Option<Submitted>, EngineError> {
+        let terms = terms.clone();
+        self.readers.run(move |c| shares::refuse(c, Timestamp::now().as_millisecond(), &new, &terms)).await
+    }
+
+    /// Drops a job that is nowhere else, because somebody has removed its messages.
+    pub(super) async fn drop_removed(&self, id: JobId) -> Result<(), EngineError> {
+        self.lock_open().remove(&id);
+        let dropped = self.writer.run(move |ctx| {
+            ctx.connection.execute("DELETE FROM jobs WHERE id = ?1", [id.to_string()])?;
+            ctx.connection.execute("DELETE FROM projected WHERE job = ?1", [id.to_string()]).map(|_| ())
+        });
+        dropped.await
     }
 
     /// A job that has not ended, as it was last seen.
@@ -183,7 +216,7 @@ impl Projection {
             let then = then.as_millisecond();
             ctx.connection.execute(&format!("UPDATE projected SET whole = 0 WHERE job IN ({old})"), [then])?;
             ctx.connection.execute(&format!("DELETE FROM events WHERE job IN ({old})"), [then])?;
-            Ok(())
+            shares::drop_old(ctx.connection, ctx.now)
         });
         dropped.await
     }
@@ -252,8 +285,9 @@ fn apply(ctx: &mut Ctx<'_>, open: &Open, seq: u64, name: Name, entry: Entry) -> 
     }
     let mut open = open.lock().unwrap_or_else(|e| e.into_inner());
     match entry {
-        Entry::Forgotten { at } => {
+        Entry::Forgotten { at, accepted_at, cost } => {
             open.remove(&id);
+            shares::note(ctx.connection, &tenant, id, accepted_at.map_or(0, Timestamp::as_millisecond), cost)?;
             ctx.connection.execute("DELETE FROM jobs WHERE id = ?1", [&text_id])?;
             note(ctx, &tenant, &text_id, seq, true, Some(at))
         }
@@ -262,6 +296,7 @@ fn apply(ctx: &mut Ctx<'_>, open: &Open, seq: u64, name: Name, entry: Entry) -> 
             let newest: Option<u64> =
                 ctx.connection.prepare_cached(newest)?.query_row([&text_id], |row| row.get(0)).optional()?;
             let before = record.last_seq - told.len() as u64;
+            shares::note(ctx.connection, &tenant, id, record.job.created_at.as_millisecond(), record.cost)?;
             upsert(ctx, &text_id, &record, newest.is_none())?;
             match newest {
                 Some(newest) if newest == before => {

@@ -5,6 +5,7 @@
 //! and an outbox between the two.) The newest entry is the job; the older ones are its events.
 
 use super::layout::Name;
+use crate::engine::sqlite::shares::Cost;
 use crate::engine::{Claim, NewJob, Outcome, Renewal, Update};
 use crate::job::spec::INPUT;
 use crate::job::spec::Work;
@@ -34,6 +35,9 @@ pub(super) struct Record {
     /// Who is to be told of the end, until that is settled.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub notice: Option<Owed>,
+    /// What it cost so far.
+    #[serde(default)]
+    pub cost: Cost,
 }
 
 /// A notice of the end that is owed. Its time is one of day, and nodes may disagree about it by what their clocks do: then it is sent
@@ -47,11 +51,14 @@ pub(super) struct Owed {
     pub due_ms: Option<i64>,
 }
 
-/// A worker's hold. There is no time of day in it: see [`Leases`](super::leases).
+/// A worker's hold. No time of day decides how long it lasts: see [`Leases`](super::leases).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Hold {
     pub worker: String,
     pub lease_ms: u64,
+    /// When it began, milliseconds since the epoch; for its cost only.
+    #[serde(default)]
+    pub since_ms: i64,
 }
 
 /// One message of a job's subject.
@@ -62,7 +69,14 @@ pub(super) enum Entry {
     Changed { record: Box<Record>, told: Vec<Event> },
     /// The job was forgotten then. Kept for longer than idempotency keys are, so that a key's job that is gone is not taken
     /// for one that was never made; and so that every node hears of it.
-    Forgotten { at: Timestamp },
+    Forgotten {
+        at: Timestamp,
+        /// When it was accepted, and what it cost: its tenant's quota counts it still.
+        #[serde(default)]
+        accepted_at: Option<Timestamp>,
+        #[serde(default)]
+        cost: Cost,
+    },
 }
 
 impl Entry {
@@ -123,10 +137,11 @@ impl Record {
             outputs: Vec::new(),
             problem: None,
         };
+        let cost = Cost { vertices: new.vertices, ..Cost::default() };
         let held = spec.work.held().into_iter().map(|(name, blob)| (name.to_owned(), blob));
         let held = held.chain(spec.work.inputs()).map(|(name, blob)| (name, blob.hex())).collect();
         let notice = spec.webhook.as_ref().map(|webhook| Owed { url: webhook.url.clone(), attempts: 0, due_ms: None });
-        Self { job, tenant: new.tenant.clone(), last_seq: 0, losses: 0, hold: None, held, notice }
+        Self { job, tenant: new.tenant.clone(), last_seq: 0, losses: 0, hold: None, held, notice, cost }
     }
 
     pub(super) fn name(&self) -> Name {
@@ -196,7 +211,8 @@ impl Draft {
         job.revision += 1;
         job.started_at.get_or_insert(self.now);
         (job.progress, job.eta_s) = (None, None);
-        self.record.hold = Some(Hold { worker: worker.to_owned(), lease_ms: lease.as_millis() as u64 });
+        let (lease_ms, since_ms) = (lease.as_millis() as u64, self.now.as_millisecond());
+        self.record.hold = Some(Hold { worker: worker.to_owned(), lease_ms, since_ms });
         self.tell_state();
     }
 
@@ -269,8 +285,13 @@ impl Draft {
 
     fn go_with(&mut self, state: State, outputs: Vec<Output>, metrics: Option<Value>, problem: Option<Failure>) {
         // whoever held it holds it no more, unless it is only told to stop
-        if state != State::Canceling {
-            self.record.hold = None;
+        if state != State::Canceling
+            && let Some(hold) = self.record.hold.take()
+            && hold.since_ms > 0
+        {
+            let (now, cost) = (self.now.as_millisecond(), &mut self.record.cost);
+            cost.ran_ms += (now - hold.since_ms).max(0);
+            cost.stopped_at = now;
         }
         let job = &mut self.record.job;
         job.state = state;

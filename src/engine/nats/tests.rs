@@ -13,9 +13,14 @@ use nats_server::NatsServer;
 /// Longer than any step may take.
 const PATIENCE: Duration = Duration::from_secs(30);
 /// What the suite asks for.
-const QUICK: Terms = Terms { lease: conformance::LEASE, max_losses: 2 };
+fn quick() -> Terms {
+    conformance::terms()
+}
+
 /// Terms under which nobody is lost while a test runs.
-const CALM: Terms = Terms { lease: Duration::from_secs(300), max_losses: 5 };
+fn calm() -> Terms {
+    Terms { lease: Duration::from_secs(300), ..Terms::default() }
+}
 
 /// A server, and a folder for the nodes that a test opens on it.
 struct Cluster {
@@ -71,5 +76,5 @@ async fn eventually<T>(what: &str, mut look: impl AsyncFnMut() -> Option<T>) -> 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn keeps_every_promise_of_an_engine() {
     let Some(cluster) = Cluster::start() else { return };
-    conformance::run(cluster.node(QUICK).await).await;
+    conformance::run(cluster.node(quick()).await).await;
 }

@@ -1,6 +1,7 @@
 //! Rows and what they mean: records, events, and the changes that keep both together.
 
 use super::notices;
+use super::shares::{self, Cost};
 use crate::engine::{Claim, Counts, EventPage, ListQuery, NewJob, Page, Renewal, Update};
 use crate::job::spec::Work;
 use crate::job::{Event, EventKind, Failure, Job, JobId, JobKind, Output, ProgressView, State};
@@ -133,6 +134,7 @@ pub(super) fn insert(ctx: &mut Ctx<'_>, new: &NewJob) -> rusqlite::Result<()> {
             settings
         ],
     )?;
+    shares::note(ctx.connection, &new.tenant, new.id, ctx.now, Cost { vertices: new.vertices, ..Cost::default() })?;
     for (name, blob) in spec.work.held() {
         name_blob(ctx.connection, new.id, name, &blob.hex())?;
     }
@@ -241,6 +243,9 @@ pub(super) fn change(ctx: &mut Ctx<'_>, id: JobId, change: Change) -> rusqlite::
     let finished = change.state.ended().then_some(ctx.now);
     // whoever held it holds it no more, unless it is only told to stop
     let keeps_hold = change.state == State::Canceling;
+    if !keeps_hold {
+        shares::stop(ctx.connection, id, ctx.now)?;
+    }
     ctx.connection.execute(
         "UPDATE jobs SET state = ?2, revision = revision + 1, finished_at = ?3, outputs = ?4, metrics = ?5, problem = ?6,
             worker = CASE WHEN ?7 THEN worker END, lease_until = CASE WHEN ?7 THEN lease_until END

@@ -7,7 +7,7 @@ use rusqlite::Connection;
 pub(super) const APPLICATION: i32 = 0x7368_6b64;
 
 /// One step per version; `user_version` counts the steps that were taken. A step is never edited once released.
-const MIGRATIONS: [&str; 5] = [
+const MIGRATIONS: [&str; 6] = [
     "
     CREATE TABLE jobs (
         id          TEXT PRIMARY KEY,
@@ -108,6 +108,50 @@ const MIGRATIONS: [&str; 5] = [
     ) STRICT, WITHOUT ROWID;
     CREATE INDEX notices_by_time ON notices (due_at);
 ",
+    // what each tenant has of the queue, kept by triggers, and what its jobs cost
+    "
+    ALTER TABLE jobs ADD COLUMN claimed_at INTEGER;
+    CREATE INDEX jobs_queued ON jobs (tenant, id) WHERE state = 'queued';
+    CREATE TABLE shares (
+        tenant  TEXT PRIMARY KEY,
+        queued  INTEGER NOT NULL,
+        running INTEGER NOT NULL,
+        turn    INTEGER NOT NULL DEFAULT 0
+    ) STRICT, WITHOUT ROWID;
+    INSERT INTO shares (tenant, queued, running)
+        SELECT tenant, SUM(state = 'queued'), SUM(state IN ('running', 'canceling')) FROM jobs GROUP BY tenant;
+    CREATE INDEX shares_in_turn ON shares (running, turn, tenant, queued) WHERE queued > 0;
+    CREATE INDEX shares_by_turn ON shares (turn);
+    CREATE TRIGGER share_of_a_new_job AFTER INSERT ON jobs BEGIN
+        INSERT INTO shares (tenant, queued, running)
+            VALUES (NEW.tenant, NEW.state = 'queued', NEW.state IN ('running', 'canceling'))
+            ON CONFLICT (tenant) DO UPDATE SET queued = queued + excluded.queued, running = running + excluded.running;
+    END;
+    CREATE TRIGGER share_of_a_changed_job AFTER UPDATE OF state ON jobs WHEN OLD.state <> NEW.state BEGIN
+        UPDATE shares SET
+            queued = queued + (NEW.state = 'queued') - (OLD.state = 'queued'),
+            running = running + (NEW.state IN ('running', 'canceling')) - (OLD.state IN ('running', 'canceling')),
+            turn = CASE WHEN NEW.state = 'running' THEN (SELECT MAX(turn) + 1 FROM shares) ELSE turn END
+        WHERE tenant = NEW.tenant;
+    END;
+    CREATE TRIGGER share_of_a_job_that_goes AFTER DELETE ON jobs BEGIN
+        UPDATE shares SET
+            queued = queued - (OLD.state = 'queued'),
+            running = running - (OLD.state IN ('running', 'canceling'))
+        WHERE tenant = OLD.tenant;
+    END;
+    CREATE TABLE costs (
+        job         TEXT PRIMARY KEY,
+        tenant      TEXT NOT NULL,
+        accepted_at INTEGER NOT NULL,
+        vertices    INTEGER NOT NULL,
+        ran_ms      INTEGER NOT NULL,
+        stopped_at  INTEGER NOT NULL
+    ) STRICT, WITHOUT ROWID;
+    CREATE INDEX costs_asked ON costs (tenant, accepted_at, vertices);
+    CREATE INDEX costs_ran ON costs (tenant, stopped_at, ran_ms);
+    CREATE INDEX costs_by_age ON costs (accepted_at, stopped_at);
+",
 ];
 
 /// Brings the file to this version.
@@ -148,5 +192,11 @@ mod tests {
         connection.execute_batch("PRAGMA foreign_keys = ON; DELETE FROM jobs WHERE id = 'a'").expect("deletes");
         let left: u32 = connection.query_row("SELECT COUNT(*) FROM labels", [], |row| row.get(0)).expect("reads");
         assert_eq!(left, 0, "labels go with their job");
+        let share = "SELECT queued FROM shares WHERE tenant = 'default'";
+        assert_eq!(
+            connection.query_row(share, [], |row| row.get::<_, u32>(0)).expect("reads"),
+            0,
+            "nor does its share stay"
+        );
     }
 }

@@ -1,5 +1,6 @@
 //! `/v1/jobs/{id}/sensitivity`: how a loss of a job's surface changes with the network that it came from.
 
+use super::super::rates::Rate;
 use super::{App, Problem, accepted, answer_submit, body, idempotency_key, job_id, query, surface_blob, tell_accepted};
 use crate::auth::{Caller, Scope};
 use crate::blobs::BlobId;
@@ -59,6 +60,7 @@ pub async fn differentiate(
     let key = idempotency_key(&headers)?;
     let id = job_id(&id)?;
     let bytes = body::read(body, app.limits.input_bytes).await?;
+    app.rates.take(tenant, Rate::UploadedBytes, bytes.len() as u64)?;
     let checked = bytes.clone();
     let checked = tokio::task::spawn_blocking(move || check_gradient(&checked).map(|()| BlobId::of(&checked)));
     let hash = checked.await.map_err(|error| {
@@ -89,8 +91,10 @@ pub async fn differentiate(
         labels: BTreeMap::new(),
         traceparent: None,
         webhook: None,
+        deadline_s: Some(app.limits.job_seconds),
     };
-    let submitted = app.engine.submit(NewJob { tenant: tenant.clone(), id: JobId::new(), spec, key }).await?;
+    let new = NewJob { tenant: tenant.clone(), id: JobId::new(), spec, vertices: 0, key };
+    let submitted = app.engine.submit(new).await?;
     drop(promise);
     tell_accepted(&submitted, clock);
     answer_submit(&app, tenant, &headers, accepted(submitted)?).await

@@ -113,12 +113,19 @@ pub fn read_spec(value: &Value, faults: &mut Faults) -> JobSpec {
             None => (Work::Fit(Fitting { meshes: Vec::new(), fit: FitSpec::default() }), Vec::new()),
         },
     };
-    let mut spec = JobSpec { work, outputs, labels: BTreeMap::new(), traceparent: None, webhook: None };
+    let mut spec =
+        JobSpec { work, outputs, labels: BTreeMap::new(), traceparent: None, webhook: None, deadline_s: None };
     if let Some(outputs) = value.get("outputs") {
         spec.outputs = read_outputs(outputs, kind, faults);
     }
     if let Some(labels) = value.get("labels") {
         spec.labels = read_labels(labels, faults);
+    }
+    if let Some(seconds) = value.get("deadline_s") {
+        spec.deadline_s = faults.count(seconds, "/deadline_s");
+        if spec.deadline_s == Some(0) {
+            faults.add("/deadline_s", "out_of_range", "a deadline is at least 1 second after the start");
+        }
     }
     spec.webhook = value.get("webhook").and_then(|webhook| read_webhook(webhook, faults));
     spec
@@ -136,7 +143,8 @@ fn read_webhook(value: &Value, faults: &mut Faults) -> Option<WebhookSpec> {
 
 /// Reads what the engine stored of a sensitivity.
 fn read_sensing(value: &Value, faults: &mut Faults) -> Option<Sensing> {
-    let object = faults.object(value, "", &["kind", "of", "field", "surface", "gradient", "outputs", "labels"])?;
+    let object =
+        faults.object(value, "", &["kind", "of", "field", "surface", "gradient", "outputs", "labels", "deadline_s"])?;
     let field = object.get("field").map(|field| read_field(field, "/field", faults));
     let mut blob = |name: &str| object.get(name).and_then(|id| read_input(id, &format!("/{name}"), faults));
     let (surface, gradient) = (blob("surface"), blob("gradient"));
@@ -151,9 +159,8 @@ fn read_sensing(value: &Value, faults: &mut Faults) -> Option<Sensing> {
 /// Reads what a fit is of.
 fn read_fitting(value: &Value, faults: &mut Faults) -> Fitting {
     let mut fitting = Fitting { meshes: Vec::new(), fit: FitSpec::default() };
-    let Some(object) = faults.object(value, "", &["kind", "meshes", "fit", "outputs", "labels", "webhook"]) else {
-        return fitting;
-    };
+    let known = ["kind", "meshes", "fit", "outputs", "labels", "webhook", "deadline_s"];
+    let Some(object) = faults.object(value, "", &known) else { return fitting };
     match object.get("meshes") {
         None => faults.add("/meshes", "missing_member", "a fit needs meshes, the names of uploaded inputs"),
         Some(Value::Array(list)) if list.is_empty() => faults.add("/meshes", "too_few", "a fit needs a mesh"),
@@ -224,8 +231,19 @@ fn read_shrinking(value: &Value, faults: &mut Faults) -> Shrinking {
         shrink: ShrinkSpec::default(),
         budget: Budget::default(),
     };
-    let known =
-        ["kind", "field", "weight", "warm_start", "latent_motion", "shrink", "budget", "outputs", "labels", "webhook"];
+    let known = [
+        "kind",
+        "field",
+        "weight",
+        "warm_start",
+        "latent_motion",
+        "shrink",
+        "budget",
+        "outputs",
+        "labels",
+        "webhook",
+        "deadline_s",
+    ];
     let Some(object) = faults.object(value, "", &known) else { return spec };
     match object.get("field") {
         Some(field) => spec.field = read_field(field, "/field", faults),

@@ -2,7 +2,7 @@
 
 use crate::app::{App, PATIENCE, small, state};
 use crate::cluster::nats_server::NatsServer;
-use crate::walk::follow;
+use crate::walk::{follow, frames};
 use eventsource_stream::Eventsource;
 use futures::StreamExt;
 use reqwest::{Method, StatusCode};
@@ -51,11 +51,34 @@ async fn submit_under(nodes: &[(String, reqwest::Client)], key: &str) -> String 
     unreachable!("the turns do not end")
 }
 
+/// GET that asks again, as clients do, when it is told that the servers have not agreed on a leader yet.
+async fn get_under(app: &App, path: &str) -> reqwest::Response {
+    let clock = Instant::now();
+    loop {
+        let answer = app.request(Method::GET, path).header("Last-Event-ID", "0").send().await.expect("an answer");
+        if answer.status() != StatusCode::SERVICE_UNAVAILABLE {
+            assert_eq!(answer.status(), StatusCode::OK, "{path}");
+            return answer;
+        }
+        assert!(answer.headers().contains_key("retry-after"), "it says when to ask again");
+        assert!(clock.elapsed() < PATIENCE, "no answer to {path}\n{}", app.log());
+        tokio::time::sleep(Duration::from_millis(200)).await;
+    }
+}
+
 /// Checks that a job ended well and once: its events are numbered from 1 without a gap, and only the last one is its end.
 async fn ended_once(app: &App, id: &str) -> Value {
-    let job = app.ended(id).await;
+    let clock = Instant::now();
+    let job = loop {
+        let job: Value = get_under(app, &format!("/v1/jobs/{id}")).await.json().await.expect("JSON");
+        if state(&job) != "queued" && state(&job) != "running" {
+            break job;
+        }
+        assert!(clock.elapsed() < PATIENCE, "still {job}\n{}", app.log());
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    };
     assert_eq!(state(&job), "succeeded", "{job}");
-    let events = follow(app, id, Some(0)).await;
+    let events = frames(get_under(app, &format!("/v1/jobs/{id}/events")).await).await;
     let ends = events.iter().filter(|event| event.1 == "done").count();
     assert_eq!((ends, events.last().map(|event| event.1.as_str())), (1, Some("done")), "{events:?}");
     assert_eq!(events.iter().map(|e| e.0).collect::<Vec<_>>(), (1..=events.len() as u64).collect::<Vec<_>>());

@@ -8,13 +8,13 @@ use std::time::Instant;
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_job_of_a_dead_node_is_taken_up_by_another() {
     let Some(cluster) = Cluster::start() else { return };
-    let (a, b) = (cluster.node(QUICK).await, cluster.node(QUICK).await);
+    let (a, b) = (cluster.node(quick()).await, cluster.node(quick()).await);
     let id = submit(&a).await;
     let first = claim(&a).await;
     drop(a);
     let second = claim(&b).await;
     assert_eq!((second.id, second.attempt), (id, 2));
-    let back = cluster.node(QUICK).await;
+    let back = cluster.node(quick()).await;
     assert_eq!(back.renew(&first, Vec::new()).await.expect("answers"), Renewal::Lost);
     assert_eq!(back.interrupted(&first).await, Renewal::Lost);
     let late = back.finish(&first, Outcome::Canceled).await;
@@ -26,7 +26,7 @@ async fn a_job_of_a_dead_node_is_taken_up_by_another() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_worker_that_lives_keeps_its_job_whoever_watches() {
     let Some(cluster) = Cluster::start() else { return };
-    let (a, b) = (cluster.node(QUICK).await, cluster.node(QUICK).await);
+    let (a, b) = (cluster.node(quick()).await, cluster.node(quick()).await);
     submit(&a).await;
     let claim = claim(&a).await;
     for _ in 0..9 {
@@ -38,9 +38,9 @@ async fn a_worker_that_lives_keeps_its_job_whoever_watches() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_submit_that_died_before_the_queue_is_put_there_by_any_node() {
+async fn a_job_whose_node_died_as_it_was_stored_is_claimed_by_any_other() {
     let Some(cluster) = Cluster::start() else { return };
-    let (a, b) = (cluster.node(CALM).await, cluster.node(CALM).await);
+    let (a, b) = (cluster.node(calm()).await, cluster.node(calm()).await);
     let new = conformance::new_job();
     a.node.ledger.create(&new, now()).await.expect("stores").expect("is new");
     drop(a);
@@ -50,7 +50,7 @@ async fn a_submit_that_died_before_the_queue_is_put_there_by_any_node() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_submit_that_died_after_its_key_is_finished_by_its_repetition() {
     let Some(cluster) = Cluster::start() else { return };
-    let (a, b) = (cluster.node(CALM).await, cluster.node(CALM).await);
+    let (a, b) = (cluster.node(calm()).await, cluster.node(calm()).await);
     let key = IdempotencyKey { key: "k".to_owned(), fingerprint: "one".to_owned() };
     let keyed = || NewJob { key: Some(key.clone()), ..conformance::new_job() };
     let new = keyed();
@@ -67,11 +67,10 @@ async fn a_submit_that_died_after_its_key_is_finished_by_its_repetition() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_job_whose_request_cannot_be_read_fails_and_holds_nobody_up() {
     let Some(cluster) = Cluster::start() else { return };
-    let a = cluster.node(CALM).await;
+    let a = cluster.node(calm()).await;
     let new = conformance::new_job();
     let draft = record::Draft::accepted(&new, now());
     a.node.ledger.write(&Name::new(&own(), new.id), draft, Expect::Nothing).await.expect("stores").expect("is new");
-    a.node.enqueue(&Name::new(&own(), new.id)).await;
     let next = submit(&a).await;
     assert_eq!(claim(&a).await.id, next);
     let failed = job(&a, new.id).await;
@@ -81,7 +80,7 @@ async fn a_job_whose_request_cannot_be_read_fails_and_holds_nobody_up() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_job_claimed_for_a_worker_that_went_away_is_given_back() {
     let Some(cluster) = Cluster::start() else { return };
-    let a = cluster.node(CALM).await;
+    let a = cluster.node(calm()).await;
     let waiting = tokio::spawn({
         let a = a.clone();
         async move { a.claim("gone", 1, PATIENCE).await }
@@ -97,7 +96,7 @@ async fn a_job_claimed_for_a_worker_that_went_away_is_given_back() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_message_whose_first_try_was_stored_after_all_is_told_from_one_that_came_too_late() {
     let Some(cluster) = Cluster::start() else { return };
-    let a = cluster.node(CALM).await;
+    let a = cluster.node(calm()).await;
     let Ledger { link, layout, .. } = &*a.node.ledger;
     let (subject, x) = (layout.job(&Name::new(&own(), JobId::new())), bytes::Bytes::from_static(b"x"));
     let store = async |expect, id, is_repetition| {
@@ -121,8 +120,8 @@ async fn a_message_whose_first_try_was_stored_after_all_is_told_from_one_that_ca
 async fn a_killed_server_loses_nothing_that_was_accepted() {
     let Some(mut cluster) = Cluster::start() else { return };
     // leases shorter than the interruption would be lost without anybody's fault
-    let terms = Terms { lease: Duration::from_secs(6), max_losses: 2 };
-    let (a, b) = (cluster.node(terms).await, cluster.node(terms).await);
+    let terms = Terms { lease: Duration::from_secs(6), ..quick() };
+    let (a, b) = (cluster.node(terms.clone()).await, cluster.node(terms).await);
     let running = submit(&a).await;
     let held = claim(&a).await;
     let stop = tokio_util::sync::CancellationToken::new();
@@ -172,7 +171,7 @@ async fn a_killed_server_loses_nothing_that_was_accepted() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn calls_end_in_time_while_the_server_is_away_and_work_when_it_is_back() {
     let Some(mut cluster) = Cluster::start() else { return };
-    let a = cluster.node(CALM).await;
+    let a = cluster.node(calm()).await;
     let id = submit(&a).await;
     a.health().await.expect("healthy");
     cluster.server.kill();
@@ -199,12 +198,13 @@ async fn a_cluster_of_three_keeps_every_promise_and_goes_on_without_one_of_them(
     let folder = tempfile::tempdir().expect("folder");
     let hosts = servers.each_ref().map(|server| server.url().trim_start_matches("nats://").to_owned()).join(",");
     let address: Address = format!("nats://{hosts}?replicas=3").parse().expect("an address");
-    let open = async |terms| {
-        eventually("the servers agree", async || NatsEngine::open(&address, folder.path(), terms).await.ok()).await
+    let open = async |terms: Terms| {
+        let open = async || NatsEngine::open(&address, folder.path(), terms.clone()).await.ok();
+        eventually("the servers agree", open).await
     };
-    let (a, b) = (Arc::new(open(QUICK).await), open(QUICK).await);
+    let (a, b) = (Arc::new(open(quick()).await), open(quick()).await);
     conformance::run(a.clone()).await;
-    let terms_outlive_an_election = open(Terms { lease: Duration::from_secs(20), max_losses: 2 }).await;
+    let terms_outlive_an_election = open(Terms { lease: Duration::from_secs(20), ..quick() }).await;
     let id = submit(&a).await;
     let held = claim(&terms_outlive_an_election).await;
     let info = a.node.ledger.layout.jobs.get_info().await.expect("is there");
@@ -238,4 +238,16 @@ async fn a_cluster_of_three_keeps_every_promise_and_goes_on_without_one_of_them(
         }
     }
     servers[leader].restart();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_job_that_somebody_removed_from_the_stream_holds_nobody_up() {
+    let Some(cluster) = Cluster::start() else { return };
+    let a = cluster.node(calm()).await;
+    let gone = submit(&a).await;
+    let subject = a.node.ledger.layout.job(&Name::new(&own(), gone));
+    a.node.ledger.layout.jobs.purge().filter(subject).await.expect("purges");
+    let next = submit(&a).await;
+    assert_eq!(claim(&a).await.id, next);
+    assert_eq!(a.depth().await.expect("counts").oldest_queued, None);
 }

@@ -31,7 +31,7 @@ async fn all_events(engine: &Arc<NatsEngine>, id: JobId) -> Vec<Event> {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn events_are_the_same_on_every_node_also_on_one_that_joins_late() {
     let Some(cluster) = Cluster::start() else { return };
-    let (a, b) = (cluster.node(CALM).await, cluster.node(CALM).await);
+    let (a, b) = (cluster.node(calm()).await, cluster.node(calm()).await);
     let id = submit(&a).await;
     let live_on_b = tokio::spawn({
         let b = b.clone();
@@ -41,7 +41,7 @@ async fn events_are_the_same_on_every_node_also_on_one_that_joins_late() {
     for i in 0..40 {
         a.renew(&claim, news(i)).await.expect("renews");
     }
-    let in_the_middle = cluster.node(CALM).await;
+    let in_the_middle = cluster.node(calm()).await;
     let live_on_late = tokio::spawn({
         let late = in_the_middle.clone();
         async move { all_events(&late, id).await }
@@ -55,14 +55,14 @@ async fn events_are_the_same_on_every_node_also_on_one_that_joins_late() {
     assert_eq!(numbers, (1..=124).collect::<Vec<_>>(), "numbered from 1 without a gap");
     assert_eq!(live_on_b.await.expect("no panic"), on_a);
     assert_eq!(live_on_late.await.expect("no panic"), on_a);
-    let at_the_end = cluster.node(CALM).await;
+    let at_the_end = cluster.node(calm()).await;
     assert_eq!(all_events(&at_the_end, id).await, on_a);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_job_is_seen_on_every_node_as_soon_as_it_is_accepted() {
     let Some(cluster) = Cluster::start() else { return };
-    let (a, b) = (cluster.node(CALM).await, cluster.node(CALM).await);
+    let (a, b) = (cluster.node(calm()).await, cluster.node(calm()).await);
     for _ in 0..20 {
         let id = submit(&a).await;
         assert_eq!(job(&b, id).await.state, State::Queued);
@@ -82,7 +82,7 @@ async fn a_job_is_seen_on_every_node_as_soon_as_it_is_accepted() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_cancel_on_one_node_stops_a_worker_on_another() {
     let Some(cluster) = Cluster::start() else { return };
-    let (a, b) = (cluster.node(CALM).await, cluster.node(CALM).await);
+    let (a, b) = (cluster.node(calm()).await, cluster.node(calm()).await);
     let id = submit(&b).await;
     let claim = claim(&a).await;
     let told = tokio::spawn({
@@ -101,7 +101,7 @@ async fn a_cancel_on_one_node_stops_a_worker_on_another() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn fifty_clients_with_one_key_on_three_nodes_make_one_job() {
     let Some(cluster) = Cluster::start() else { return };
-    let nodes = [cluster.node(CALM).await, cluster.node(CALM).await, cluster.node(CALM).await];
+    let nodes = [cluster.node(calm()).await, cluster.node(calm()).await, cluster.node(calm()).await];
     let clients = (0..50).map(|i| {
         let node = nodes[i % 3].clone();
         let key = Some(IdempotencyKey { key: "the same".to_owned(), fingerprint: "one".to_owned() });
@@ -127,7 +127,7 @@ async fn fifty_clients_with_one_key_on_three_nodes_make_one_job() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn nodes_share_the_jobs_and_none_is_run_twice() {
     let Some(cluster) = Cluster::start() else { return };
-    let nodes = [cluster.node(CALM).await, cluster.node(CALM).await, cluster.node(CALM).await];
+    let nodes = [cluster.node(calm()).await, cluster.node(calm()).await, cluster.node(calm()).await];
     let mut ids = Vec::new();
     for i in 0..30 {
         ids.push(submit(&nodes[i % 3]).await);
@@ -159,7 +159,7 @@ async fn nodes_share_the_jobs_and_none_is_run_twice() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_blob_is_given_up_only_when_no_node_can_come_to_name_it() {
     let Some(cluster) = Cluster::start() else { return };
-    let (a, b) = (cluster.node(CALM).await, cluster.node(CALM).await);
+    let (a, b) = (cluster.node(calm()).await, cluster.node(calm()).await);
     let mut ended = Vec::new();
     for node in [&a, &b, &a] {
         ended.push(submit(node).await);
@@ -195,7 +195,7 @@ async fn a_blob_is_given_up_only_when_no_node_can_come_to_name_it() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_key_outlives_its_job() {
     let Some(cluster) = Cluster::start() else { return };
-    let (a, b) = (cluster.node(CALM).await, cluster.node(CALM).await);
+    let (a, b) = (cluster.node(calm()).await, cluster.node(calm()).await);
     let key = IdempotencyKey { key: "k".to_owned(), fingerprint: "one".to_owned() };
     let keyed = || NewJob { key: Some(key.clone()), ..conformance::new_job() };
     let Submitted::Created(job) = a.submit(keyed()).await.expect("submits") else { panic!("a new job") };
@@ -208,9 +208,9 @@ async fn a_key_outlives_its_job() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn services_with_different_prefixes_do_not_meet() {
     let Some(cluster) = Cluster::start() else { return };
-    let a = cluster.node(CALM).await;
+    let a = cluster.node(calm()).await;
     let address = format!("{}?prefix=OTHER", cluster.server.url()).parse().expect("an address");
-    let other = NatsEngine::open(&address, cluster.folder.path(), CALM).await.expect("opens");
+    let other = NatsEngine::open(&address, cluster.folder.path(), calm()).await.expect("opens");
     let id = submit(&a).await;
     assert_eq!(other.get(&own(), id).await.expect("reads"), None);
     assert!(other.claim("b", 1, Duration::from_millis(200)).await.expect("claims").is_empty());
@@ -221,7 +221,7 @@ async fn services_with_different_prefixes_do_not_meet() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_nobody_asks_for_any_more_is_tidied_up_and_nothing_else() {
     let Some(cluster) = Cluster::start() else { return };
-    let a = cluster.node(CALM).await;
+    let a = cluster.node(calm()).await;
     let ledger = &a.node.ledger;
     let (open, ended, forgotten) = (submit(&a).await, submit(&a).await, submit(&a).await);
     let orphan = Name::new(&own(), JobId::new());
