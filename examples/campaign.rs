@@ -4,18 +4,24 @@
 //! cargo build --release --bin shrinkd
 //! cargo run --release --example campaign -- --engine sqlite --seconds 1200
 //! cargo run --release --example campaign -- --engine nats --seconds 1200 --seed 7
+//! cargo run --release --example campaign -- --engine nats --blobs bucket --seconds 1200
 //! ```
 //!
-//! Clients submit small jobs under keys and repeat a submit until it is answered. Meanwhile nodes are killed and frozen, with `nats` the
-//! server, too, and now and then everything at once. At the end all is started again, every accepted job must come to its end, and what
-//! it made is downloaded and compared with the hash that its record promises. Exits 1 when a job was lost, ended twice or left
-//! half an output. `--program` names the service ([`service::PROGRAM`] by default); the NATS server is found as the tests find it.
+//! Clients submit small jobs under keys, repeat a submit until it is answered, and wait for an end before they submit far more than one
+//! machine computes. Meanwhile nodes are killed and frozen, with `nats` the server, too, and now and then everything at once; with
+//! `--blobs bucket` the blobs lie in a bucket whose connections are cut or slow for seconds at a time. At the end all is started again,
+//! every accepted job must come to its end, and what it made is downloaded and compared with the hash that its record promises. Exits 1
+//! when a job was lost, ended twice or left half an output. `--program` names the service ([`service::PROGRAM`] by default); the NATS
+//! server and the bucket's are found as the tests find them.
 
+#[path = "../tests/support/bucket.rs"]
+mod bucket;
 #[path = "../tests/support/nats_server.rs"]
 mod nats_server;
 #[path = "../tests/support/service.rs"]
 mod service;
 
+use bucket::Bucket;
 use nats_server::NatsServer;
 use reqwest::{Client, StatusCode};
 use serde_json::{Value, json};
@@ -32,7 +38,9 @@ const NODES: usize = 3;
 const CLIENTS: usize = 6;
 /// Short, so that many leases are lost.
 const LEASE: Duration = Duration::from_secs(3);
-/// Time for what was accepted to come to its end once the faults are over.
+/// Jobs of a client that have not ended yet, at most.
+const OPEN: usize = 5;
+/// Once the faults are over, time for another of the accepted jobs to come to its end after the one before.
 const PATIENCE: Duration = Duration::from_secs(300);
 
 /// Numbers that only depend on the seed (Steele et al. 2014, splitmix64).
@@ -80,7 +88,7 @@ fn request(radius: f64) -> Value {
 /// Submits under one key until somebody answers, to any node each time. A quarter of all keys are used by two at once.
 async fn client(number: usize, seed: u64, urls: Vec<String>, ledger: Arc<Mutex<Ledger>>, over: Arc<AtomicBool>) {
     let http = Client::builder().timeout(Duration::from_secs(10)).build().expect("a client");
-    let mut random = Random(seed);
+    let (mut random, mut open) = (Random(seed), Vec::new());
     for i in 0.. {
         if over.load(Ordering::SeqCst) {
             return;
@@ -115,6 +123,25 @@ async fn client(number: usize, seed: u64, urls: Vec<String>, ledger: Arc<Mutex<L
             }
         });
         futures::future::join_all(submits).await;
+        let made = ledger.lock().expect("ledger").accepted.get(&key).cloned();
+        open.extend(made);
+        while open.len() >= OPEN && !over.load(Ordering::SeqCst) {
+            let url = &urls[random.below(urls.len() as u64) as usize];
+            let mut left = Vec::new();
+            for id in open {
+                // who does not answer is asked again
+                let answer = http.get(format!("{url}/v1/jobs/{id}")).send().await;
+                let job = match answer {
+                    Ok(answer) if answer.status().is_success() => answer.json().await.unwrap_or_default(),
+                    _ => Value::Null,
+                };
+                if !job["finished_at"].is_string() {
+                    left.push(id);
+                }
+            }
+            open = left;
+            tokio::time::sleep(random.millis(100, 500)).await;
+        }
         tokio::time::sleep(random.millis(50, 500)).await;
     }
 }
@@ -125,12 +152,14 @@ struct Faults {
     kills: u32,
     freezes: u32,
     server: u32,
+    bucket: u32,
     everything: u32,
 }
 
 async fn torment(
     nodes: &mut [Node],
     server: &mut Option<NatsServer>,
+    bucket: Option<&Bucket>,
     until: Instant,
     random: &mut Random,
 ) -> Outcome<Faults> {
@@ -139,6 +168,18 @@ async fn torment(
         tokio::time::sleep(random.millis(500, 4000)).await;
         for node in nodes.iter_mut() {
             node.revive()?;
+        }
+        if let Some(bucket) = bucket
+            && random.below(3) == 0
+        {
+            faults.bucket += 1;
+            match random.below(2) {
+                0 => bucket.cut(),
+                _ => bucket.delay(random.millis(500, 3000)),
+            }
+            tokio::time::sleep(random.millis(500, 5000)).await;
+            bucket.delay(Duration::ZERO);
+            continue;
         }
         let victim = random.below(nodes.len() as u64) as usize;
         match random.below(10) {
@@ -260,12 +301,18 @@ async fn main() -> Outcome<ExitCode> {
         None | Some("sqlite") => (None, "sqlite".to_owned(), 1),
         Some(other) => return Err(format!("--engine is sqlite or nats, and not {other}").into()),
     };
-    let variables = [
+    let bucket = match option("--blobs").as_deref() {
+        Some("bucket") => Some(Bucket::start().await.ok_or("there is no moto_server")?),
+        None | Some("folder") => None,
+        Some(other) => return Err(format!("--blobs is folder or bucket, and not {other}").into()),
+    };
+    let mut variables = vec![
         ("SHRINKD_ENGINE", engine),
         ("SHRINKD_WORKER__LEASE_S", LEASE.as_secs().to_string()),
         // a job that is lost again and again is what this is about
         ("SHRINKD_WORKER__MAX_LOSSES", "1000000".to_owned()),
     ];
+    variables.extend(bucket.iter().flat_map(|bucket| bucket.variables("campaign")));
     let nodes = (0..count).map(|_| Node::start(&program, folder.path(), &variables));
     let mut nodes = nodes.collect::<Outcome<Vec<_>>>()?;
     let urls: Vec<String> = nodes.iter().map(Node::url).collect();
@@ -274,12 +321,12 @@ async fn main() -> Outcome<ExitCode> {
         .map(|i| tokio::spawn(client(i, random.below(u64::MAX), urls.clone(), ledger.clone(), over.clone())))
         .collect();
     let until = Instant::now() + Duration::from_secs(seconds);
-    let faults = torment(&mut nodes, &mut server, until, &mut random).await?;
+    let faults = torment(&mut nodes, &mut server, bucket.as_ref(), until, &mut random).await?;
     over.store(true, Ordering::SeqCst);
     for client in clients {
         client.await?;
     }
-    let (http, deadline) = (Client::builder().timeout(Duration::from_secs(20)).build()?, Instant::now() + PATIENCE);
+    let http = Client::builder().timeout(Duration::from_secs(20)).build()?;
     let (accepted, broken) = {
         let ledger = ledger.lock().expect("ledger");
         (ledger.accepted.clone(), ledger.broken.clone())
@@ -287,19 +334,21 @@ async fn main() -> Outcome<ExitCode> {
     let mut counts = Counts::default();
     for (i, id) in accepted.values().enumerate() {
         nodes.iter_mut().try_for_each(Node::revive)?;
-        judge(&http, &urls[i % urls.len()], id, deadline, &mut counts).await?;
+        judge(&http, &urls[i % urls.len()], id, Instant::now() + PATIENCE, &mut counts).await?;
     }
     broken.iter().for_each(|what| println!("{what}"));
     println!(
-        "| engine | nodes | seconds | node kills | freezes | server kills | everything killed | accepted | attempts | ended once | ended twice | lost | half-written |"
+        "| engine | blobs | nodes | seconds | node kills | freezes | server kills | bucket faults | everything killed | accepted | attempts | ended once | ended twice | lost | half-written |"
     );
-    println!("|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|");
+    println!("|---|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|");
     println!(
-        "| {} | {count} | {seconds} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
+        "| {} | {} | {count} | {seconds} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
         if server.is_some() { "nats" } else { "sqlite" },
+        if bucket.is_some() { "bucket" } else { "folder" },
         faults.kills,
         faults.freezes,
         faults.server,
+        faults.bucket,
         faults.everything,
         accepted.len(),
         counts.attempts,

@@ -4,6 +4,7 @@
 //! environment. The defaults need nothing: one folder, loopback only.
 
 use crate::engine::nats::{Address, InvalidAddress};
+use crate::job::memory;
 use crate::notify::signature::Secret;
 use crate::quota::Quotas;
 use figment::Figment;
@@ -173,6 +174,9 @@ pub struct Limits {
 pub struct WorkerConfig {
     /// Jobs at once (`SHRINKD_WORKER__SLOTS`): 2, so that one loads or writes while another computes.
     pub slots: usize,
+    /// Bytes of memory that its jobs may be estimated to take together (`SHRINKD_WORKER__MEMORY_BYTES`): 0 is four fifths of what the
+    /// machine, or the process's control group, has.
+    pub memory_bytes: u64,
     /// Threads of the pool that all jobs share (`SHRINKD_WORKER__THREADS`): 0 is one per core.
     pub threads: usize,
     /// Seconds a job is held without a heartbeat (`SHRINKD_WORKER__LEASE_S`).
@@ -249,7 +253,7 @@ impl Default for Config {
                 job_bytes: 0,
             },
             quotas: Quotas::default(),
-            worker: WorkerConfig { slots: 2, threads: 0, lease_s: 30, max_losses: 5 },
+            worker: WorkerConfig { slots: 2, memory_bytes: 0, threads: 0, lease_s: 30, max_losses: 5 },
             webhooks: WebhooksConfig { ports: vec![443], ..WebhooksConfig::default() },
             log: LogConfig { format: LogFormat::Pretty, filter: "info".to_owned() },
             traces: TracesConfig { endpoint: String::new(), sample_ratio: 1.0 },
@@ -307,6 +311,23 @@ impl Config {
 }
 
 impl Config {
+    /// Bytes of memory that the jobs of this node's worker may take together; `None` where nobody can tell what there is.
+    pub fn worker_memory(&self) -> Option<u64> {
+        match self.worker.memory_bytes {
+            0 => memory::of_machine().map(|bytes| bytes / 5 * 4),
+            bytes => Some(bytes),
+        }
+    }
+
+    /// Bytes of memory that a job may take that this node accepts: what is said, or what its own worker has.
+    pub fn job_memory(&self) -> Option<u64> {
+        match (self.limits.job_bytes, self.role) {
+            (0, Role::All) => self.worker_memory(),
+            (0, _) => None,
+            (bytes, _) => Some(bytes),
+        }
+    }
+
     /// Whether it would let strangers in: beyond loopback, without asking who they are, and without having been told to.
     pub fn is_open_to_strangers(&self) -> bool {
         self.role != Role::Worker

@@ -50,6 +50,8 @@ pub struct App {
     pub blobs: Blobs,
     /// Sizes that requests may have.
     pub limits: Limits,
+    /// Bytes of memory that a job may be estimated to take, where that is limited.
+    pub job_memory: Option<u64>,
     /// How long outputs are kept.
     pub retention: Retention,
     /// How long a link into the bucket is good for that a download is answered with; zero sends the bytes.

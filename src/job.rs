@@ -7,6 +7,7 @@
 pub mod collector;
 pub mod event;
 pub mod failure;
+pub mod memory;
 pub mod pipeline;
 pub mod preview;
 pub mod priority;

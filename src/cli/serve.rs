@@ -10,6 +10,7 @@ use crate::config::{AuthMode, Config, FOLDER, Role, SQLITE};
 use crate::grpc;
 use crate::http::rates::Rates;
 use crate::http::{self, App};
+use crate::job::memory::Memory;
 use crate::job::worker::Worker;
 use crate::job::{collector, priority};
 use crate::notify::courier::{Courier, SystemNames};
@@ -147,12 +148,14 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
         metrics::worker_started(config.worker.slots, pool.current_num_threads());
     }
     let (engine_of_worker, blobs_of_worker) = (engine.clone(), blobs.clone());
+    let memory = config.worker_memory().map(|bytes| Arc::new(Memory::new(bytes)));
     let worker = move || Worker {
         engine: engine_of_worker,
         blobs: blobs_of_worker,
         pool: Arc::new(pool),
         slots: config.worker.slots,
         job_seconds: config.limits.job_seconds,
+        memory,
         name: format!("worker-{}", uuid::Uuid::now_v7()),
     };
     let worker = (config.role != Role::Api).then(|| tokio::spawn(worker().run(stop.clone())));
@@ -167,6 +170,7 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
         engine,
         blobs,
         limits: config.limits.clone(),
+        job_memory: config.job_memory(),
         retention: config.retention,
         download_link: Duration::from_secs(config.download_link_s),
         metrics: exposition,

@@ -89,8 +89,8 @@ impl Shrinkd for Service {
             jobs::judge(&self.app, &tenant, &message::request(request.spec, &request.json)?).await
         };
         let estimate = judge.await.map_err(|problem| asked.refuse(problem))?;
-        let (vertices, evaluations) = (estimate.vertices, estimate.evaluations);
-        Ok(Response::new(proto::EstimateResponse { vertices, evaluations }))
+        let jobs::Estimate { vertices, evaluations, memory_bytes, .. } = estimate;
+        Ok(Response::new(proto::EstimateResponse { vertices, evaluations, memory_bytes }))
     }
 
     async fn get(&self, request: Request<proto::GetRequest>) -> Answer<proto::Job> {

@@ -7,7 +7,7 @@ use crate::blobs::BlobId;
 use crate::field::FieldError;
 use crate::field::input::{Description, FieldOptions};
 use crate::field::network::family::Family;
-use crate::job::{Failure, pipeline, spec};
+use crate::job::{Failure, memory, pipeline, spec};
 use crate::telemetry::metrics;
 use crate::tenant::Tenant;
 use axum::Json;
@@ -46,6 +46,11 @@ impl Input {
     /// Whether it is a network that takes a latent code.
     pub(super) fn has_latent_code(&self) -> bool {
         matches!(self.description, Description::Network { latent_size, .. } if latent_size > 0)
+    }
+
+    /// Bytes of memory that it takes once it is a field.
+    pub(super) fn memory(&self) -> u64 {
+        memory::of_input(self.bytes, &self.description)
     }
 
     /// Whether it is a mesh.

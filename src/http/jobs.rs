@@ -10,7 +10,7 @@ use crate::blobs::BlobId;
 use crate::engine::{Forgotten, IdempotencyKey, NewJob, Submitted};
 use crate::field::{Fault, FieldError};
 use crate::job::spec::{FieldSpec, Fitting, WebhookSpec, Work};
-use crate::job::{Failure, Job, JobId, JobKind, JobSpec, OutputName, pipeline};
+use crate::job::{Failure, Job, JobId, JobKind, JobSpec, OutputName, memory, pipeline};
 use crate::notify::target::Rules;
 use crate::shrink::Method;
 use crate::telemetry::metrics;
@@ -46,6 +46,8 @@ pub struct Estimate {
     pub(crate) vertices: u64,
     /// Field evaluations, estimated.
     pub(crate) evaluations: u64,
+    /// Bytes of memory, estimated from above.
+    pub(crate) memory_bytes: u64,
 }
 
 /// Submits a job
@@ -111,8 +113,10 @@ pub(crate) struct Accepted {
 pub(crate) async fn judge(app: &App, tenant: &Tenant, request: &Value) -> Result<Estimate, Problem> {
     let spec = read(app, request)?;
     let _promise = app.blobs.promise().await;
-    let (spec, dimension) = look_up(app, tenant, spec, request).await?;
-    Ok(estimate(&spec, dimension))
+    let (spec, fields) = look_up(app, tenant, spec, request).await?;
+    let estimate = estimate(&spec, &fields);
+    check_memory(app, estimate.memory_bytes)?;
+    Ok(estimate)
 }
 
 /// Accepts a request for a job, whatever way it came: the job is durable before this returns.
@@ -135,11 +139,13 @@ pub(crate) async fn accept(
     }
     // no blob goes from the moment that it is looked up until the new job's record names it
     let promise = app.blobs.promise().await;
-    let (spec, dimension) = look_up(app, tenant, spec, request).await?;
+    let (mut spec, fields) = look_up(app, tenant, spec, request).await?;
+    let Estimate { vertices, memory_bytes, .. } = estimate(&spec, &fields);
+    check_memory(app, memory_bytes)?;
+    spec.memory_bytes = Some(memory_bytes);
     if app.stop.is_cancelled() {
         return Err(Problem::unavailable("stopping", "the service is stopping"));
     }
-    let vertices = estimate(&spec, dimension).vertices;
     let new = NewJob { tenant: tenant.clone(), id: JobId::new(), spec, vertices, key };
     let submitted = app.engine.submit(new).await?;
     drop(promise);
@@ -188,14 +194,23 @@ fn check_webhook(rules: Option<&Rules>, url: &str) -> Result<(), Problem> {
     })
 }
 
-/// Looks up everything that a request names, and completes it. Tells the field's dimension, too.
-async fn look_up(app: &App, tenant: &Tenant, spec: JobSpec, request: &Value) -> Result<(JobSpec, u8), Problem> {
-    let dimension = check_fields(app, tenant, &spec).await?;
-    let mut spec = spec.for_dimension(dimension, request).map_err(|faults| Problem::invalid_request("", &faults))?;
+/// Looks up everything that a request names, and completes it.
+async fn look_up(app: &App, tenant: &Tenant, spec: JobSpec, request: &Value) -> Result<(JobSpec, Fields), Problem> {
+    let fields = check_fields(app, tenant, &spec).await?;
+    let mut spec =
+        spec.for_dimension(fields.dimension, request).map_err(|faults| Problem::invalid_request("", &faults))?;
     if matches!(&spec.work, Work::Shrink(work) if work.warm_start.is_some()) {
         warm_start::resolve(app, tenant, &mut spec).await?;
     }
-    Ok((spec, dimension))
+    Ok((spec, fields))
+}
+
+/// Refuses what needs more memory than a job may.
+fn check_memory(app: &App, needed: u64) -> Result<(), Problem> {
+    match app.job_memory {
+        Some(limit) if needed > limit => Err(Failure::memory_exceeded(needed, limit).into()),
+        _ => Ok(()),
+    }
 }
 
 /// What the engine made of a submit.
@@ -436,17 +451,25 @@ pub(crate) fn read_key(text: &str) -> Option<String> {
     is_key.then(|| text.trim().to_owned())
 }
 
-/// Checks what the field and the weight name. Tells the field's dimension.
-async fn check_fields(app: &App, tenant: &Tenant, spec: &JobSpec) -> Result<u8, Problem> {
+/// What is known of a job's fields before it runs.
+struct Fields {
+    /// Of the field: 3 for surfaces, 2 for curves.
+    dimension: u8,
+    /// Bytes of memory that all of them take.
+    memory: u64,
+}
+
+/// Checks what the field and the weight name.
+async fn check_fields(app: &App, tenant: &Tenant, spec: &JobSpec) -> Result<Fields, Problem> {
     let work = match &spec.work {
         Work::Shrink(work) => work,
         Work::Fit(fitting) => {
-            check_meshes(app, tenant, &fitting.meshes).await?;
-            return Ok(3);
+            let memory = check_meshes(app, tenant, &fitting.meshes).await?;
+            return Ok(Fields { dimension: 3, memory });
         }
-        Work::Sensitivity(_) => return Ok(3),
+        Work::Sensitivity(_) => return Ok(Fields { dimension: 3, memory: 0 }),
     };
-    let dimension = check_field(app, tenant, &work.field, "/field").await?;
+    let mut fields = check_field(app, tenant, &work.field, "/field").await?;
     if work.latent_motion {
         let input = match work.field.input {
             Some(id) => Some(described(app, tenant, id, "/field/input").await?),
@@ -458,14 +481,16 @@ async fn check_fields(app: &App, tenant: &Tenant, spec: &JobSpec) -> Result<u8, 
             return Err(Problem::invalid_request("", &[fault]));
         }
     }
-    if let Some(weight) = &work.weight
-        && check_field(app, tenant, weight, "/weight").await? != 3
-    {
-        let detail = "a weight is a field of dimension 3".to_owned();
-        let fault = Fault { pointer: "/weight".to_owned(), code: "dimension", detail };
-        return Err(Problem::invalid_request("", &[fault]));
+    if let Some(weight) = &work.weight {
+        let weight = check_field(app, tenant, weight, "/weight").await?;
+        if weight.dimension != 3 {
+            let detail = "a weight is a field of dimension 3".to_owned();
+            let fault = Fault { pointer: "/weight".to_owned(), code: "dimension", detail };
+            return Err(Problem::invalid_request("", &[fault]));
+        }
+        fields.memory = fields.memory.saturating_add(weight.memory);
     }
-    Ok(dimension)
+    Ok(fields)
 }
 
 /// The blob of a job's output `surface`, if it made one.
@@ -485,26 +510,34 @@ async fn described(app: &App, tenant: &Tenant, id: BlobId, pointer: &str) -> Res
     inputs::read_note(&note)
 }
 
-/// Checks that the inputs which a fit names are there, and meshes.
-async fn check_meshes(app: &App, tenant: &Tenant, meshes: &[BlobId]) -> Result<(), Problem> {
+/// Checks that the inputs which a fit names are there, and meshes. Bytes of memory that all of them take.
+async fn check_meshes(app: &App, tenant: &Tenant, meshes: &[BlobId]) -> Result<u64, Problem> {
+    let mut memory = 0u64;
     for (i, &id) in meshes.iter().enumerate() {
         let pointer = format!("/meshes/{i}");
-        if !described(app, tenant, id, &pointer).await?.is_mesh() {
+        let input = described(app, tenant, id, &pointer).await?;
+        memory = memory.saturating_add(input.memory());
+        if !input.is_mesh() {
             let detail = format!("{id} is no mesh, and a network is fitted to meshes");
             return Err(Problem::invalid_request("", &[Fault { pointer, code: "not_a_mesh", detail }]));
         }
     }
-    Ok(())
+    Ok(memory)
 }
 
-/// Checks what a field names, at `pointer`: the scene in the request, or the input that must be there. Tells its dimension.
-async fn check_field(app: &App, tenant: &Tenant, field: &FieldSpec, pointer: &'static str) -> Result<u8, Problem> {
+/// Checks what a field names, at `pointer`: the scene in the request, or the input that must be there.
+async fn check_field(app: &App, tenant: &Tenant, field: &FieldSpec, pointer: &'static str) -> Result<Fields, Problem> {
     if let Some(id) = field.input {
-        return Ok(described(app, tenant, id, &format!("{pointer}/input")).await?.dimension());
+        let input = described(app, tenant, id, &format!("{pointer}/input")).await?;
+        return Ok(Fields { dimension: input.dimension(), memory: input.memory() });
     }
-    let Some(scene) = field.scene.clone() else { return Ok(3) };
+    let Some(scene) = field.scene.clone() else { return Ok(Fields { dimension: 3, memory: 0 }) };
     // a scene may be large: checked off the runtime
-    let checked = tokio::task::spawn_blocking(move || pipeline::check_scene(&scene)).await.map_err(|error| {
+    let checked = tokio::task::spawn_blocking(move || {
+        let memory = memory::of_scene(scene.to_string().len() as u64);
+        pipeline::check_scene(&scene).map(|dimension| Fields { dimension, memory })
+    });
+    let checked = checked.await.map_err(|error| {
         tracing::error!(%error, "a scene could not be checked");
         Problem::internal()
     })?;
@@ -515,15 +548,19 @@ async fn check_field(app: &App, tenant: &Tenant, field: &FieldSpec, pointer: &'s
     })
 }
 
-fn estimate(spec: &JobSpec, dimension: u8) -> Estimate {
-    let shrink = match &spec.work {
+fn estimate(spec: &JobSpec, fields: &Fields) -> Estimate {
+    let (vertices, evaluations) = estimate_work(&spec.work, fields.dimension);
+    let memory_bytes = memory::of_job(&spec.work, vertices, fields.memory);
+    Estimate { valid: true, vertices, evaluations, memory_bytes }
+}
+
+/// Vertices and evaluations of a job.
+fn estimate_work(work: &Work, dimension: u8) -> (u64, u64) {
+    let shrink = match work {
         Work::Shrink(work) => &work.shrink,
-        Work::Fit(Fitting { meshes, fit }) => {
-            // of the meshes' distances; the network is evaluated as often in every epoch
-            let evaluations = meshes.len() as u64 * u64::from(fit.samples);
-            return Estimate { valid: true, vertices: 0, evaluations };
-        }
-        Work::Sensitivity(_) => return Estimate { valid: true, vertices: 0, evaluations: 0 },
+        // of the meshes' distances; the network is evaluated as often in every epoch
+        Work::Fit(Fitting { meshes, fit }) => return (0, meshes.len() as u64 * u64::from(fit.samples)),
+        Work::Sensitivity(_) => return (0, 0),
     };
     if dimension == 2 {
         let vertices = u64::from(shrink.curve_samples());
@@ -531,14 +568,14 @@ fn estimate(spec: &JobSpec, dimension: u8) -> Estimate {
             Method::Adaptive => CONTOUR_EVALUATIONS + vertices,
             Method::Paper => CURVE_PAPER_EVALUATIONS * vertices,
         };
-        return Estimate { valid: true, vertices, evaluations };
+        return (vertices, evaluations);
     }
     let vertices = shrink.lattice.vertices();
     let per_vertex = match shrink.method {
         Method::Adaptive => ADAPTIVE_EVALUATIONS,
         Method::Paper => PAPER_EVALUATIONS,
     };
-    Estimate { valid: true, vertices, evaluations: (vertices as f64 * per_vertex).round() as u64 }
+    (vertices, (vertices as f64 * per_vertex).round() as u64)
 }
 
 /// What `POST /v1/jobs` answers with 200.

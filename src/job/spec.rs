@@ -191,7 +191,13 @@ pub struct JobSpec {
     /// Seconds that an attempt may run before it is stopped and the job has failed; the service's limit when nothing is said.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub deadline_s: Option<u32>,
+    /// Bytes of memory that it is estimated to take: known to the engine only, no client can say it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub memory_bytes: Option<u64>,
 }
+
+/// Where an engine's stored request has what no client can say, besides the trace.
+const MEMORY: &str = "memory_bytes";
 
 /// Who is told of the end of a job.
 #[derive(Clone, Debug, PartialEq, Serialize, utoipa::ToSchema)]
@@ -306,9 +312,11 @@ impl JobSpec {
     /// # Errors
     /// As [`from_value`](Self::from_value): it was stored by a version that knew more.
     pub fn from_stored(mut value: Value) -> Result<Self, Vec<Fault>> {
-        let traceparent = value.as_object_mut().and_then(|members| members.remove(TRACEPARENT));
+        let mut own = |name| value.as_object_mut().and_then(|members| members.remove(name));
+        let (traceparent, memory) = (own(TRACEPARENT), own(MEMORY));
         let spec = Self::from_value(&value)?;
-        Ok(Self { traceparent: traceparent.and_then(|text| text.as_str().map(str::to_owned)), ..spec })
+        let traceparent = traceparent.and_then(|text| text.as_str().map(str::to_owned));
+        Ok(Self { traceparent, memory_bytes: memory.and_then(|bytes| bytes.as_u64()), ..spec })
     }
 
     /// Reads a request.

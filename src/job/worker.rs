@@ -4,6 +4,7 @@
 //! it has free slots, renews each claim every third of its lease, and stops a computation within a heartbeat of losing it.
 
 use super::failure::{Ended, Failure};
+use super::memory::Memory;
 use super::preview::MeshPreview;
 use super::priority;
 use super::spec::{FieldSpec, Work};
@@ -35,6 +36,8 @@ const CHECKPOINT_EVERY: Duration = Duration::from_secs(5);
 const CLAIM_WAIT: Duration = Duration::from_secs(20);
 /// Pause after the engine failed, so that a broken disk does not make a busy loop.
 const BACKOFF: Duration = Duration::from_secs(1);
+/// How often a job that waits for memory looks whether it is still wanted.
+const ROOM_LOOK: Duration = Duration::from_millis(200);
 /// How often the end of a job is tried to be written before it is left to the next attempt.
 const FINISH_TRIES: u32 = 5;
 /// Time that running jobs get to come to their end once the service stops.
@@ -66,6 +69,8 @@ pub struct Worker {
     pub slots: usize,
     /// Seconds that an attempt may run whose job does not say.
     pub job_seconds: u32,
+    /// What its jobs may take together, where that is limited.
+    pub memory: Option<Arc<Memory>>,
     /// Name of this worker, different for every process.
     pub name: String,
 }
@@ -141,7 +146,18 @@ impl Worker {
     async fn run_attempt(&self, claim: Claim, give_back: CancellationToken) -> &'static str {
         let cancel = CancelToken::new();
         let (news, mut inbox) = mpsc::unbounded_channel();
-        let mut work = tokio::spawn(self.work(claim.clone(), cancel.clone(), news).in_current_span());
+        let work = self.work(claim.clone(), cancel.clone(), news);
+        // of what comes first: a job that waits for memory can be canceled, and its time runs
+        let needed = claim.spec.memory_bytes.unwrap_or(0);
+        let (memory, waiting) = (self.memory.clone(), cancel.clone());
+        let work = async move {
+            let _room = match &memory {
+                Some(memory) => Some(until_canceled(&waiting, memory.take(needed)).await?),
+                None => None,
+            };
+            work.await
+        };
+        let mut work = tokio::spawn(work.in_current_span());
         let interrupted = self.engine.interrupted(&claim);
         tokio::pin!(interrupted);
         let beat = claim.lease / 3;
@@ -376,6 +392,22 @@ impl Worker {
             }
         }
         "unfinished"
+    }
+}
+
+/// Waits for room, unless the job is no longer wanted before there is any.
+async fn until_canceled<T>(
+    cancel: &CancelToken,
+    room: impl Future<Output = Result<T, Failure>>,
+) -> Result<T, Unfinished> {
+    tokio::pin!(room);
+    loop {
+        if cancel.is_canceled() {
+            return Err(Unfinished::Ended(Ended::Canceled));
+        }
+        if let Ok(room) = tokio::time::timeout(ROOM_LOOK, &mut room).await {
+            return room.map_err(Unfinished::from);
+        }
     }
 }
 

@@ -381,6 +381,20 @@ async fn a_watcher_may_go_away_and_one_that_stays_is_told_when_the_service_stops
     assert_eq!(end.get_error_details().error_info().map(|info| info.reason.clone()).as_deref(), Some("stopping"));
 }
 
+#[tokio::test]
+async fn what_is_over_a_quota_is_told_in_the_language_of_the_call() {
+    let folder = tempfile::tempdir().expect("folder");
+    let app = App::start_with(folder.path(), &[("SHRINKD_QUOTAS__DEFAULT__REQUESTS_PER_MINUTE", "1")]);
+    let mut client = connect(&app).await;
+    let answer = client.estimate(EstimateRequest { spec: Some(object(&small())), json: String::new() }).await;
+    let answer = answer.expect("is let through");
+    let policy = answer.metadata().get("ratelimit-policy").expect("is told").to_str().expect("text");
+    assert_eq!(policy, "\"requests_per_minute\";q=1;w=60");
+    assert!(answer.into_inner().memory_bytes > 1 << 20);
+    let details = refused(client.submit(submission(&small())).await, Code::ResourceExhausted, "quota_exceeded");
+    assert!(details.retry_info().and_then(|info| info.retry_delay).is_some_and(|delay| delay.as_secs() >= 1));
+}
+
 fn serving(answer: &HealthCheckResponse) -> bool {
     answer.status() == ServingStatus::Serving
 }

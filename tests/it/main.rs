@@ -17,6 +17,7 @@ mod issuer;
 mod losses;
 mod metrics;
 mod monitoring;
+mod quotas;
 mod reading;
 mod refusals;
 mod relaxed;

@@ -9,13 +9,13 @@ use std::time::{Duration, Instant};
 
 const AUTH: [(&str, &str); 1] = [("SHRINKD_AUTH__MODE", "required")];
 
-fn keys(folder: &Path, arguments: &[&str]) -> String {
+pub fn keys(folder: &Path, arguments: &[&str]) -> String {
     let made = Command::new(BINARY).arg("keys").args(arguments).arg("--data").arg(folder).output().expect("runs");
     assert!(made.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&made.stderr));
     String::from_utf8(made.stdout).expect("text").trim().to_owned()
 }
 
-async fn ask(app: &App, key: &str, method: Method, path: &str, body: &'static [u8]) -> Response {
+pub async fn ask(app: &App, key: &str, method: Method, path: &str, body: &'static [u8]) -> Response {
     let media_type = if path.starts_with("/v1/jobs") { "application/json" } else { "application/octet-stream" };
     let mut request = app.request(method, path).bearer_auth(key).header("content-type", media_type);
     if !body.is_empty() {
@@ -24,7 +24,7 @@ async fn ask(app: &App, key: &str, method: Method, path: &str, body: &'static [u
     request.send().await.expect("an answer")
 }
 
-async fn eventually(what: &str, mut look: impl AsyncFnMut() -> bool) {
+pub async fn eventually(what: &str, mut look: impl AsyncFnMut() -> bool) {
     let clock = Instant::now();
     while !look().await {
         assert!(clock.elapsed() < PATIENCE, "not in time: {what}");

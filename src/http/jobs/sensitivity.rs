@@ -1,12 +1,15 @@
 //! `/v1/jobs/{id}/sensitivity`: how a loss of a job's surface changes with the network that it came from.
 
 use super::super::rates::Rate;
-use super::{App, Problem, accepted, answer_submit, body, idempotency_key, job_id, query, surface_blob, tell_accepted};
+use super::{
+    App, Problem, accepted, answer_submit, body, check_memory, idempotency_key, job_id, query, surface_blob,
+    tell_accepted,
+};
 use crate::auth::{Caller, Scope};
 use crate::blobs::BlobId;
 use crate::engine::{IdempotencyKey, NewJob};
 use crate::job::spec::{Sensing, Work};
-use crate::job::{Job, JobId, JobKind, JobSpec, OutputName, State as JobState};
+use crate::job::{Job, JobId, JobKind, JobSpec, OutputName, State as JobState, memory};
 use crate::surface::sensitivity::check_gradient;
 use crate::tenant::Tenant;
 use axum::body::Body;
@@ -82,16 +85,21 @@ pub async fn differentiate(
     // no blob goes from the moment that it is looked up until the new job's record names it
     let promise = app.blobs.promise().await;
     let job = app.engine.get(tenant, id).await?.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
-    let mut sensing = sensing(&app, tenant, &job).await?;
+    let (mut sensing, network) = sensing(&app, tenant, &job).await?;
+    let memory = network.saturating_add(memory::of_gradient(bytes.len() as u64));
     sensing.gradient = app.blobs.put_unseen(bytes).await?;
     let outputs = OutputName::of(JobKind::Sensitivity).to_vec();
+    let work = Work::Sensitivity(Box::new(sensing));
+    let memory = memory::of_job(&work, 0, memory);
+    check_memory(&app, memory)?;
     let spec = JobSpec {
-        work: Work::Sensitivity(Box::new(sensing)),
+        work,
         outputs,
         labels: BTreeMap::new(),
         traceparent: None,
         webhook: None,
         deadline_s: Some(app.limits.job_seconds),
+        memory_bytes: Some(memory),
     };
     let new = NewJob { tenant: tenant.clone(), id: JobId::new(), spec, vertices: 0, key };
     let submitted = app.engine.submit(new).await?;
@@ -100,8 +108,8 @@ pub async fn differentiate(
     answer_submit(&app, tenant, &headers, accepted(submitted)?).await
 }
 
-/// What is differentiated of a job, with its surface in the place of the gradient.
-async fn sensing(app: &App, tenant: &Tenant, job: &Job) -> Result<Sensing, Problem> {
+/// What is differentiated of a job, with its surface in the place of the gradient; and bytes of memory that its network takes.
+async fn sensing(app: &App, tenant: &Tenant, job: &Job) -> Result<(Sensing, u64), Problem> {
     let no = |detail: &str| {
         let detail = format!("job {} {detail}", job.id);
         Problem::conflict("not_differentiable", "the job has no surface of a network", detail)
@@ -114,9 +122,10 @@ async fn sensing(app: &App, tenant: &Tenant, job: &Job) -> Result<Sensing, Probl
     };
     let Some(input) = work.field.input else { return Err(no("is of a scene, which has no weights")) };
     let note = app.blobs.note(tenant, input).await?.ok_or_else(|| no("is of an input that is gone"))?;
-    if !super::inputs::read_note(&note)?.is_network() {
+    let described = super::inputs::read_note(&note)?;
+    if !described.is_network() {
         return Err(no("is of a field that is no network"));
     }
     let surface = surface_blob(job).ok_or_else(|| no("did not make the output \"surface\""))?;
-    Ok(Sensing { of: job.id, field: work.field, surface, gradient: surface })
+    Ok((Sensing { of: job.id, field: work.field, surface, gradient: surface }, described.memory()))
 }

@@ -113,8 +113,15 @@ pub fn read_spec(value: &Value, faults: &mut Faults) -> JobSpec {
             None => (Work::Fit(Fitting { meshes: Vec::new(), fit: FitSpec::default() }), Vec::new()),
         },
     };
-    let mut spec =
-        JobSpec { work, outputs, labels: BTreeMap::new(), traceparent: None, webhook: None, deadline_s: None };
+    let mut spec = JobSpec {
+        work,
+        outputs,
+        labels: BTreeMap::new(),
+        traceparent: None,
+        webhook: None,
+        deadline_s: None,
+        memory_bytes: None,
+    };
     if let Some(outputs) = value.get("outputs") {
         spec.outputs = read_outputs(outputs, kind, faults);
     }
