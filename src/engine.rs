@@ -347,6 +347,8 @@ impl Changes {
 
 /// Events read at once from the engine by a follower.
 const PAGE: usize = 64;
+/// How long a follower believes that a silent job has nothing to tell before it asks the engine.
+const QUIET: Duration = Duration::from_secs(15);
 
 /// The events of a job as they happen: from `after` on when that is still kept, else from a fresh snapshot. Ends after the
 /// `done` event. `None` when there is no such job.
@@ -355,16 +357,17 @@ pub async fn follow(
     tenant: &Tenant,
     id: JobId,
     after: Option<u64>,
-) -> Result<Option<BoxStream<'static, Result<Event, EngineError>>>, EngineError> {
+) -> Result<Option<BoxStream<'static, Result<Arc<Event>, EngineError>>>, EngineError> {
     // subscribed before reading, so that nothing falls between
     let changes = engine.changes(tenant, id);
     let Some(page) = engine.events_after(tenant, id, after.unwrap_or(u64::MAX), PAGE).await? else { return Ok(None) };
     let tenant = tenant.clone();
-    let mut follower = Follower { engine, tenant, id, changes, pending: VecDeque::new(), position: 0, over: false };
+    let pending = VecDeque::new();
+    let mut follower = Follower { engine, tenant, id, changes, pending, position: 0, caught_up: false, over: false };
     match after {
         Some(after) if after <= page.newest && after.saturating_add(1) >= page.oldest => {
             follower.position = after;
-            follower.pending.extend(page.events);
+            follower.pending.extend(page.events.into_iter().map(Arc::new));
         }
         _ => follower.start_over(&page),
     }
@@ -379,9 +382,11 @@ struct Follower {
     tenant: Tenant,
     id: JobId,
     changes: Changes,
-    pending: VecDeque<Event>,
+    pending: VecDeque<Arc<Event>>,
     /// Sequence number of the last event that was given out.
     position: u64,
+    /// Whether there was nothing after it in the engine, since it listens to changes.
+    caught_up: bool,
     over: bool,
 }
 
@@ -390,43 +395,35 @@ impl Follower {
     fn start_over(&mut self, page: &EventPage) {
         let seq = if page.job.state.ended() { page.newest.saturating_sub(1) } else { page.newest };
         let data = serde_json::to_value(&page.job).unwrap_or_default();
-        self.pending = VecDeque::from([Event { seq, kind: EventKind::Snapshot, at: Timestamp::now(), data }]);
+        self.pending = VecDeque::from([Arc::new(Event { seq, kind: EventKind::Snapshot, at: Timestamp::now(), data })]);
     }
 
-    async fn next(&mut self) -> Result<Option<Event>, EngineError> {
+    async fn next(&mut self) -> Result<Option<Arc<Event>>, EngineError> {
         while !self.over {
             if let Some(event) = self.pending.pop_front() {
                 self.position = event.seq;
                 self.over = event.kind == EventKind::Done;
                 return Ok(Some(event));
             }
-            // live events that follow without a gap need no look into the engine
-            let mut fresh = None;
-            while let Ok(event) = self.changes.0.try_recv() {
-                if event.seq == self.position + 1 {
-                    fresh = Some(event);
-                    break;
+            if self.caught_up {
+                // whatever was stored since comes by itself, and the engine is asked nothing for it
+                match tokio::time::timeout(QUIET, self.changes.next()).await {
+                    Ok(Some(event)) if event.seq == self.position + 1 => self.pending.push_back(event),
+                    Ok(Some(event)) if event.seq <= self.position => {}
+                    _ => self.caught_up = false,
                 }
-            }
-            if let Some(event) = fresh {
-                self.pending.push_back(Event::clone(&event));
                 continue;
             }
             let page = self.engine.events_after(&self.tenant, self.id, self.position, PAGE).await;
             match page.inspect_err(|_| self.over = true)? {
                 None => self.over = true,
                 Some(page) if page.events.is_empty() => {
-                    if page.job.state.ended() && self.position >= page.newest {
-                        self.over = true;
-                    } else if let Some(event) = self.changes.next().await
-                        && event.seq == self.position + 1
-                    {
-                        self.pending.push_back(Event::clone(&event));
-                    }
+                    self.over = page.job.state.ended() && self.position >= page.newest;
+                    self.caught_up = true;
                 }
                 // the reader was slower than the trimming of old events
                 Some(page) if page.oldest > self.position + 1 => self.start_over(&page),
-                Some(page) => self.pending.extend(page.events),
+                Some(page) => self.pending.extend(page.events.into_iter().map(Arc::new)),
             }
         }
         Ok(None)

@@ -379,7 +379,7 @@ async fn an_end_is_told_until_that_is_settled(engine: &Arc<dyn Engine>) {
 
 async fn collect(engine: &Arc<dyn Engine>, id: JobId, after: Option<u64>) -> Vec<Event> {
     let stream = follow(engine.clone(), &own(), id, after).await.expect("follows").expect("is there");
-    let all = stream.map(|event| event.expect("reads")).collect::<Vec<_>>();
+    let all = stream.map(|event| Event::clone(&event.expect("reads"))).collect::<Vec<_>>();
     tokio::time::timeout(PATIENCE, all).await.expect("the stream ends with the job")
 }
 

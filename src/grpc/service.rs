@@ -137,7 +137,7 @@ impl Shrinkd for Service {
             let id = jobs::job_id(&id)?;
             let events = engine::follow(self.app.engine.clone(), &tenant, id, after).await?;
             let events = events.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
-            Ok(events.map(|event| Ok(message::event(&event?))).boxed())
+            Ok(events.map(|event| Ok(message::event(event?.as_ref()))).boxed())
         };
         let events = follow.await.map_err(|problem| asked.refuse(problem))?;
         Ok(Response::new(bounded(events, asked, self.app.stop.clone())))

@@ -24,7 +24,7 @@ fn success(sha256: &str) -> Outcome {
 
 async fn all_events(engine: &Arc<NatsEngine>, id: JobId) -> Vec<Event> {
     let stream = follow(engine.clone(), &own(), id, Some(0)).await.expect("follows").expect("is there");
-    let all = stream.map(|event| event.expect("reads")).collect::<Vec<_>>();
+    let all = stream.map(|event| Event::clone(&event.expect("reads"))).collect::<Vec<_>>();
     tokio::time::timeout(PATIENCE, all).await.expect("the stream ends with the job")
 }
 
