@@ -220,6 +220,50 @@ def meshes():
     put("mesh", "own_child.glb", glb({**document, "nodes": [{"children": [0], "mesh": 0}]}, positions + indices + places))
 
 
+def requests():
+    scene = {"sphere": {"radius": 0.5}}
+    blob = "sha256:" + "0123456789abcdef" * 4
+    job = "018f6f3e-7b8a-7c3d-9e4f-0123456789ab"
+    every = {
+        "kind": "shrink",
+        "field": {"input": blob, "latent": [0.1, -0.2], "level": 0.01, "domain": {"min": [-1, -1, -1], "max": [1, 1, 1]}},
+        "shrink": {"method": "adaptive", "lattice": {"octahedral": {"n": 10}}, "density": "curvature", "on_topology": "wrap"},
+        "budget": {"attempts": 2, "evaluations": 1000000},
+        "outputs": ["glb", "surface", "report"],
+        "labels": {"a": "b"},
+        "webhook": {"url": "https://example.com/hook"},
+        "warm_start": job,
+        "deadline_s": 60,
+    }
+    put("request", "least", json.dumps({"field": {"scene": scene}}))
+    put("request", "every", json.dumps(every))
+    put("request", "stored", json.dumps(dict(every, warm_start={"job": job, "surface": blob}, latent_motion=True)))
+    put("request", "weight", json.dumps({"field": {"scene": scene}, "weight": {"scene": scene}}))
+    put("request", "paper", json.dumps({"field": {"scene": scene}, "shrink": {"method": "paper", "samples": 100, "lattice": {"latlong": {"n_theta": 8, "n_phi": 4}}}}))
+    fit = {"kind": "fit", "meshes": [blob, blob], "fit": {"layers": 2, "width": 16, "activation": {"sine": {"w0": 30}}, "eikonal": 0.1}}
+    put("request", "fit", json.dumps(fit))
+    sensing = {"kind": "sensitivity", "of": job, "field": {"input": blob}, "surface": blob, "gradient": blob}
+    put("request", "sensitivity", json.dumps(sensing))
+    put("request", "faults", json.dumps({"kind": "x", "field": [], "shrink": {"lattice": {"latlong": {"n_theta": -1}}}, "deadline_s": 0}))
+
+
+def strangers():
+    for i, text in enumerate(
+        [
+            "shrinkd_0123456789ab_0123456789abcdef0123456789abcdef0123456789abcdef0123456789abcdef",
+            "https://example.com:8443/hook?a=b",
+            "http://2130706433/",
+            "https://[::ffff:127.0.0.1]/",
+            "https://user:secret@example.com/#x",
+            "tenant.of-some_kind",
+            "nats://user:secret@a:4222,b:4222?replicas=3&prefix=P",
+            "tls://a?credentials=/etc/nats.creds",
+            "whsec_b25lIHNlY3JldCBvZiB0aGUgY2hlY2sgb2Ygc2hyaW5rZA==",
+        ]
+    ):
+        put("stranger", str(i), text)
+
+
 def scenes():
     half = {"box": {"half_extents": [0.4, 0.3, 0.2]}}
     every = {
@@ -252,5 +296,5 @@ def scenes():
     put("scene", "cut", '{"union": {"of": [{"sphere": {"radius":')
 
 
-for write in [safetensors, npz, folder, grids, meshes, scenes]:
+for write in [safetensors, npz, folder, grids, meshes, scenes, requests, strangers]:
     write()

@@ -20,6 +20,7 @@ pub mod page;
 pub mod problem;
 pub mod query;
 pub mod rates;
+pub mod server;
 
 pub use problem::Problem;
 

@@ -182,7 +182,7 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
     if let Some(address) = config.metrics_listen {
         let (listener, router) = (TcpListener::bind(address).await?, http::metrics::router(app.clone()));
         tracing::info!(http.address = %listener.local_addr()?, "serving metrics");
-        tokio::spawn(axum::serve(listener, router).into_future());
+        tokio::spawn(http::server::serve(listener, router, stop.clone()));
     }
     let router = match config.role {
         Role::Worker => http::health_router(app.clone(), grpc::health_routes(app)),
@@ -190,8 +190,7 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
     };
     let router = router.layer(axum::middleware::from_fn(grpc::speak));
     let routes = router.clone();
-    let graceful = axum::serve(listener, router).with_graceful_shutdown(stop.clone().cancelled_owned());
-    let server = tokio::spawn(graceful.into_future());
+    let server = tokio::spawn(http::server::serve(listener, router, stop.clone()));
     // the program that started this one may wait for this line
     tracing::info!(http.address = %address, data.dir = %config.data_dir.display(), "listening");
     if let Some(field) = first {
@@ -210,7 +209,7 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
         if let Some(courier) = courier {
             courier.await?;
         }
-        server.await??;
+        server.await?;
         Ok::<_, Box<dyn std::error::Error>>(())
     };
     match tokio::time::timeout(DRAIN, drained).await {

@@ -7,7 +7,7 @@ use crate::auth::{Caller, Scope};
 use crate::engine::{self, ListQuery};
 use crate::field::input::FieldOptions;
 use crate::http::inputs::{self, Stored};
-use crate::http::{App, Problem, context, jobs, list, outputs};
+use crate::http::{App, Problem, body, context, jobs, list, outputs};
 use crate::tenant::Tenant;
 use axum::http::StatusCode;
 use bytes::{Bytes, BytesMut};
@@ -171,14 +171,20 @@ impl Shrinkd for Service {
     async fn upload(&self, request: Request<Streaming<proto::Chunk>>) -> Answer<proto::UploadResponse> {
         let asked = Asked::of(&request);
         let tenant = asked.may(Scope::Write).map_err(|problem| asked.refuse(problem))?;
-        let (mut chunks, limit, mut bytes) = (request.into_inner(), self.app.limits.input_bytes, BytesMut::new());
-        while let Some(chunk) = chunks.message().await? {
-            if (bytes.len() + chunk.data.len()) as u64 > limit {
-                return Err(asked.refuse(Problem::too_large(limit)));
+        let (mut chunks, limit) = (request.into_inner(), self.app.limits.input_bytes);
+        let refuse = |problem| asked.refuse(problem);
+        let read = async {
+            let mut bytes = BytesMut::new();
+            while let Some(chunk) = body::within(body::STALL, chunks.message()).await.map_err(refuse)?? {
+                if (bytes.len() + chunk.data.len()) as u64 > limit {
+                    return Err(refuse(Problem::too_large(limit)));
+                }
+                bytes.extend_from_slice(&chunk.data);
             }
-            bytes.extend_from_slice(&chunk.data);
-        }
-        let stored = inputs::store(&self.app, &tenant, bytes.freeze(), FieldOptions::default()).await;
+            Ok(bytes.freeze())
+        };
+        let bytes = body::within(body::WHOLE, read).await.map_err(refuse)??;
+        let stored = inputs::store(&self.app, &tenant, bytes, FieldOptions::default()).await;
         let (Stored::Known(input) | Stored::New(input)) = stored.map_err(|problem| asked.refuse(problem))?;
         Ok(Response::new(proto::UploadResponse {
             id: input.id.to_string(),

@@ -6,19 +6,41 @@ use axum::http::{HeaderMap, StatusCode, header};
 use bytes::{Bytes, BytesMut};
 use futures::StreamExt;
 use serde_json::Value;
+use std::time::Duration;
 
 /// Bytes that are still read, and thrown away, from a body that is too large: a client that is not listening yet would
 /// otherwise see a broken connection in place of the answer.
 const MAX_DISCARDED: u64 = 16 << 20;
 
+/// Longest time without a byte of a body that is not complete.
+pub const STALL: Duration = Duration::from_secs(30);
+/// Longest time for a whole body: the largest input over a line of three megabits a second.
+pub const WHOLE: Duration = Duration::from_secs(15 * 60);
+
 /// Reads a body of at most `limit` bytes.
 ///
 /// # Errors
-/// 413 when it is larger, 400 when it breaks off.
+/// 413 when it is larger, 400 when it breaks off, 408 when it does not go on.
 pub async fn read(body: Body, limit: u64) -> Result<Bytes, Problem> {
+    within(WHOLE, read_all(body, limit)).await?
+}
+
+/// What comes in time.
+///
+/// # Errors
+/// 408 when it does not.
+pub(crate) async fn within<T>(time: Duration, work: impl Future<Output = T>) -> Result<T, Problem> {
+    tokio::time::timeout(time, work).await.map_err(|_| {
+        let detail =
+            format!("a body goes on within {} s and is complete within {} s", STALL.as_secs(), WHOLE.as_secs());
+        Problem::new(StatusCode::REQUEST_TIMEOUT, "body_too_slow", "the body does not come", detail)
+    })
+}
+
+async fn read_all(body: Body, limit: u64) -> Result<Bytes, Problem> {
     let mut stream = body.into_data_stream();
     let (mut bytes, mut discarded) = (BytesMut::new(), 0u64);
-    while let Some(chunk) = stream.next().await {
+    while let Some(chunk) = within(STALL, stream.next()).await? {
         let chunk = chunk.map_err(|error| {
             tracing::debug!(%error, "a body broke off");
             Problem::bad_request("incomplete_body", "the body broke off", "the body ended before it was complete")
@@ -65,4 +87,25 @@ pub fn parse_json(bytes: &[u8]) -> Result<Value, Problem> {
         }
         Problem::bad_request("malformed_json", "the body is not JSON", error.to_string())
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test(start_paused = true)]
+    async fn a_body_that_does_not_go_on_is_not_waited_for() {
+        let begun = || futures::stream::iter([Ok::<_, std::io::Error>("begun")]);
+        let stalled = Body::from_stream(begun().chain(futures::stream::pending()));
+        assert_eq!(read(stalled, 100).await.expect_err("stalls").code(), "body_too_slow");
+        let dripping = futures::stream::unfold((), |()| async {
+            tokio::time::sleep(STALL / 2).await;
+            Some((Ok::<_, std::io::Error>("."), ()))
+        });
+        assert_eq!(
+            read(Body::from_stream(dripping), 1000).await.expect_err("drips").status(),
+            StatusCode::REQUEST_TIMEOUT
+        );
+        assert_eq!(read(Body::from_stream(begun()), 100).await.expect("is read"), "begun");
+    }
 }

@@ -100,7 +100,6 @@ fn says_nothing(options: &FieldOptions) -> bool {
         (status = 400, description = "a query parameter is unknown or does not fit the file, or the body broke off"),
         (status = 413, description = "the file is too large"),
         (status = 422, description = "the file cannot be read as a field"),
-        (status = 429, description = "a quota is used up"),
         (status = 503, description = "the service is stopping"),
     )
 )]

@@ -83,6 +83,7 @@ fn describe_caller(operation: &mut Operation) {
     for (status, description) in [
         ("401", "a valid key or token is needed, where the service asks who its callers are"),
         ("403", "the key or token lacks a scope"),
+        ("429", "a quota of the tenant is used up: `RateLimit` tells which, where there are quotas"),
     ] {
         operation.responses.responses.entry(status.to_owned()).or_insert_with(|| RefOr::T(Response::new(description)));
     }

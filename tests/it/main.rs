@@ -1,6 +1,7 @@
 //! Tests of the whole program from outside: the real binary, over HTTP and on the command line.
 
 mod app;
+mod backup;
 mod bucket;
 mod certify;
 mod cli;

@@ -155,3 +155,24 @@ fn strangers_are_not_let_in_unless_it_is_said() {
     assert_eq!(refused.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&refused.stderr).contains("auth.mode"), "{refused:?}");
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_key_of_a_cluster_works_on_every_node_until_it_is_revoked() {
+    let Some(server) = crate::cluster::nats_server::NatsServer::start() else { return };
+    let folder = tempfile::tempdir().expect("folder");
+    let (engine, url) = (("SHRINKD_ENGINE", server.url()), server.url());
+    let nodes = [0, 1].map(|_| App::start_with(folder.path(), &[AUTH[0], (engine.0, &engine.1)]));
+    let key = keys(folder.path(), &["create", "--tenant", "a", "--scope", "read", "--engine", &url]);
+    let all_answer = async |status: u16| {
+        for node in &nodes {
+            eventually("every node knows", async || {
+                ask(node, &key, Method::GET, "/v1/jobs", b"").await.status() == status
+            })
+            .await;
+        }
+    };
+    all_answer(200).await;
+    assert!(keys(folder.path(), &["list", "--engine", &url]).contains("\ta\tread\tworks\t"));
+    keys(folder.path(), &["revoke", key.split('_').nth(1).expect("an id"), "--engine", &url]);
+    all_answer(401).await;
+}

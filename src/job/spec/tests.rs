@@ -193,3 +193,27 @@ fn the_faults_of_a_fit_have_their_places() {
     let kind = json!({"kind": "melt", "field": {"scene": {}}});
     assert_eq!(faults(kind), [("/kind".to_owned(), "unknown_value")]);
 }
+
+#[test]
+fn what_was_read_is_read_again_as_it_was_stored() {
+    let seeds = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/seeds/request");
+    let mut read = 0;
+    for file in std::fs::read_dir(seeds).unwrap().map(|entry| entry.unwrap().path()) {
+        let value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+        match JobSpec::from_value(&value) {
+            Err(faults) => assert!(file.ends_with("faults") && faults.len() >= 4, "{file:?}: {faults:?}"),
+            Ok(spec) => {
+                read += 1;
+                let spec = JobSpec { memory_bytes: Some(7), traceparent: Some("00-a-b-01".to_owned()), ..spec };
+                let stored = serde_json::to_value(&spec).unwrap();
+                assert_eq!(JobSpec::from_stored(stored.clone()).unwrap(), spec, "{file:?}");
+                let faults = JobSpec::from_value(&stored).unwrap_err();
+                assert!(
+                    faults.iter().any(|fault| fault.pointer == "/memory_bytes"),
+                    "no client can say it: {faults:?}"
+                );
+            }
+        }
+    }
+    assert!(read >= 7);
+}
