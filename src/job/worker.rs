@@ -147,7 +147,7 @@ impl Worker {
         let cancel = CancelToken::new();
         let (news, mut inbox) = mpsc::unbounded_channel();
         let work = self.work(claim.clone(), cancel.clone(), news);
-        // of what comes first: a job that waits for memory can be canceled, and its time runs
+        // before anything is read; a job that waits for room can be canceled meanwhile, and its time runs
         let needed = claim.spec.memory_bytes.unwrap_or(0);
         let (memory, waiting) = (self.memory.clone(), cancel.clone());
         let work = async move {
