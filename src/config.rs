@@ -7,11 +7,13 @@ use crate::engine::nats::{Address, InvalidAddress};
 use crate::job::memory;
 use crate::notify::signature::Secret;
 use crate::quota::Quotas;
+use crate::tenant::Tenant;
 use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
 use ipnet::IpNet;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
@@ -192,6 +194,9 @@ pub struct WebhooksConfig {
     /// What notices are signed with (`SHRINKD_WEBHOOKS__SECRETS`, a list): `whsec_` and 24 to 64 bytes in base64; several while one
     /// takes the place of another. None: no job may ask for a notice.
     pub secrets: Vec<Secret>,
+    /// What those of some tenants are signed with, in place of that, by the tenant's name: a secret is known to every receiver that
+    /// verifies by it.
+    pub tenants: BTreeMap<Tenant, Vec<Secret>>,
     /// Whether notices may go over `http` (`SHRINKD_WEBHOOKS__ALLOW_HTTP`).
     pub allow_http: bool,
     /// The ports they may go to (`SHRINKD_WEBHOOKS__PORTS`, a list): 443. None means any.
@@ -307,6 +312,18 @@ impl Config {
             config.engine.parse::<Address>()?;
         }
         Ok(config)
+    }
+}
+
+impl WebhooksConfig {
+    /// What notices of a tenant's jobs are signed with; where there is nothing, its jobs may not ask for any.
+    pub fn secrets_of(&self, tenant: &Tenant) -> &[Secret] {
+        self.tenants.get(tenant).unwrap_or(&self.secrets)
+    }
+
+    /// Whether any job may ask for a notice.
+    pub fn is_in_use(&self) -> bool {
+        !self.secrets.is_empty() || self.tenants.values().any(|secrets| !secrets.is_empty())
     }
 }
 

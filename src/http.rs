@@ -26,9 +26,8 @@ pub use problem::Problem;
 
 use crate::auth::Authenticator;
 use crate::blobs::Blobs;
-use crate::config::{Limits, Retention};
+use crate::config::{Limits, Retention, WebhooksConfig};
 use crate::engine::Engine;
-use crate::notify::target::Rules;
 use crate::telemetry::metrics::Exposition;
 use axum::http::HeaderValue;
 use axum::middleware;
@@ -61,8 +60,8 @@ pub struct App {
     pub metrics: Exposition,
     /// Whether that is served at an address of its own.
     pub metrics_apart: bool,
-    /// Who may be told of the ends of jobs; none where nobody is.
-    pub webhooks: Option<Rules>,
+    /// Who may be told of the ends of jobs.
+    pub webhooks: Arc<WebhooksConfig>,
     /// How often tenants may ask this node.
     pub rates: Arc<Rates>,
     /// Raised when the service stops.

@@ -14,7 +14,6 @@ use crate::job::memory::Memory;
 use crate::job::worker::Worker;
 use crate::job::{collector, priority};
 use crate::notify::courier::{Courier, SystemNames};
-use crate::notify::target::Rules;
 use crate::telemetry;
 use crate::telemetry::metrics::{self, Exposition};
 use crate::telemetry::traces::Traces;
@@ -160,7 +159,7 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
     };
     let worker = (config.role != Role::Api).then(|| tokio::spawn(worker().run(stop.clone())));
     tokio::spawn(collector::run(engine.clone(), blobs.clone(), config.retention, stop.clone()));
-    let courier = if config.role == Role::Worker || config.webhooks.secrets.is_empty() {
+    let courier = if config.role == Role::Worker || !config.webhooks.is_in_use() {
         None
     } else {
         let courier = Courier::new(&config.webhooks, Arc::new(SystemNames))?;
@@ -175,7 +174,7 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
         download_link: Duration::from_secs(config.download_link_s),
         metrics: exposition,
         metrics_apart: config.metrics_listen.is_some(),
-        webhooks: (!config.webhooks.secrets.is_empty()).then(|| Rules::from(&config.webhooks)),
+        webhooks: Arc::new(config.webhooks.clone()),
         rates: Arc::new(Rates::new(config.quotas.clone())),
         stop: stop.clone(),
     };

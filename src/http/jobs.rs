@@ -7,6 +7,7 @@ use super::inputs::{self, Input};
 use super::{App, Problem, body, conditional, query};
 use crate::auth::{Caller, Scope};
 use crate::blobs::BlobId;
+use crate::config::WebhooksConfig;
 use crate::engine::{Forgotten, IdempotencyKey, NewJob, Submitted};
 use crate::field::{Fault, FieldError};
 use crate::job::spec::{FieldSpec, Fitting, WebhookSpec, Work};
@@ -111,7 +112,7 @@ pub(crate) struct Accepted {
 
 /// Estimates what a request would cost, checking it as if it were submitted.
 pub(crate) async fn judge(app: &App, tenant: &Tenant, request: &Value) -> Result<Estimate, Problem> {
-    let spec = read(app, request)?;
+    let spec = read(app, tenant, request)?;
     let _promise = app.blobs.promise().await;
     let (spec, fields) = look_up(app, tenant, spec, request).await?;
     let estimate = estimate(&spec, &fields);
@@ -127,7 +128,7 @@ pub(crate) async fn accept(
     key: Option<String>,
 ) -> Result<Accepted, Problem> {
     let clock = Instant::now();
-    let spec = read(app, request)?;
+    let spec = read(app, tenant, request)?;
     // the keys of a JSON value are sorted, so that spaces and order do not make another request
     let fingerprint = BlobId::of(request.to_string().as_bytes()).hex();
     let key = key.map(|key| IdempotencyKey { key, fingerprint });
@@ -161,7 +162,7 @@ fn tell_accepted(submitted: &Submitted, since: Instant) {
 }
 
 /// Reads a request for a job; what it names is not looked up yet.
-fn read(app: &App, request: &Value) -> Result<JobSpec, Problem> {
+fn read(app: &App, tenant: &Tenant, request: &Value) -> Result<JobSpec, Problem> {
     let mut spec = JobSpec::from_value(request).map_err(|faults| Problem::invalid_request("", &faults))?;
     if spec.work.kind() == JobKind::Sensitivity {
         let detail = "a sensitivity is asked for by POST /v1/jobs/{id}/sensitivity".to_owned();
@@ -169,7 +170,7 @@ fn read(app: &App, request: &Value) -> Result<JobSpec, Problem> {
         return Err(Problem::invalid_request("", &[fault]));
     }
     if let Some(webhook) = &spec.webhook {
-        check_webhook(app.webhooks.as_ref(), &webhook.url)?;
+        check_webhook(&app.webhooks, tenant, &webhook.url)?;
     }
     let longest = app.limits.job_seconds;
     if spec.deadline_s.is_some_and(|seconds| seconds > longest) {
@@ -182,13 +183,13 @@ fn read(app: &App, request: &Value) -> Result<JobSpec, Problem> {
 }
 
 /// Checks who is to be told of the end. What a name leads to is looked at when the notice is sent.
-fn check_webhook(rules: Option<&Rules>, url: &str) -> Result<(), Problem> {
-    let Some(rules) = rules else {
+fn check_webhook(webhooks: &WebhooksConfig, tenant: &Tenant, url: &str) -> Result<(), Problem> {
+    if webhooks.secrets_of(tenant).is_empty() {
         let detail = "this service sends no notices: it has no secret to sign them with".to_owned();
         let fault = Fault { pointer: "/webhook".to_owned(), code: "not_offered", detail };
         return Err(Problem::invalid_request("", &[fault]));
-    };
-    rules.read(url).map(|_| ()).map_err(|refused| {
+    }
+    Rules::from(webhooks).read(url).map(|_| ()).map_err(|refused| {
         let fault = Fault { pointer: "/webhook/url".to_owned(), code: refused.code, detail: refused.detail };
         Problem::invalid_request("", &[fault])
     })

@@ -1,6 +1,6 @@
 //! Connections: accepted, spoken with over HTTP/1.1 or HTTP/2, and let go when the service stops or nothing comes.
 //!
-//! Whoever connects and sends nothing costs a file for a minute and no longer: heads have to come in [`HEAD`], peers of HTTP/2 have to
+//! Whoever connects and sends nothing costs a file for a minute and no longer: heads have to come within a minute, peers of HTTP/2 have to
 //! answer a ping. Bodies have their own [limits](super::body).
 
 use axum::Router;

@@ -1,7 +1,7 @@
 //! Takes notices that are due from the engine, and sends them.
 
 use super::payload::{Notice, message_id};
-use super::signature::{Secret, sign};
+use super::signature::sign;
 use super::target::Rules;
 use super::{network, schedule};
 use crate::config::WebhooksConfig;
@@ -82,8 +82,7 @@ pub enum Attempt {
 pub struct Courier {
     client: Client,
     rules: Rules,
-    secrets: Vec<Secret>,
-    base_url: String,
+    config: WebhooksConfig,
 }
 
 impl Courier {
@@ -103,7 +102,7 @@ impl Courier {
             .pool_max_idle_per_host(0)
             .user_agent(concat!("shrinkd/", env!("CARGO_PKG_VERSION")))
             .build()?;
-        Ok(Self { client, rules, secrets: config.secrets.clone(), base_url: config.base_url.clone() })
+        Ok(Self { client, rules, config: config.clone() })
     }
 
     /// Sends what is due until the service stops. What is on its way then is due again after a while.
@@ -140,7 +139,14 @@ impl Courier {
                 return Attempt::Failed(None);
             }
         };
-        let Ok(payload) = serde_json::to_vec(&Notice::of(&notice.job, &self.base_url)) else { return Attempt::Gone };
+        let secrets = self.config.secrets_of(&notice.tenant);
+        if secrets.is_empty() {
+            tracing::warn!(job.id = %notice.job.id, "there is no secret any more to sign a webhook with");
+            return Attempt::Failed(None);
+        }
+        let Ok(payload) = serde_json::to_vec(&Notice::of(&notice.job, &self.config.base_url)) else {
+            return Attempt::Gone;
+        };
         let now = Timestamp::now();
         let request = self
             .client
@@ -148,7 +154,7 @@ impl Courier {
             .header(CONTENT_TYPE, "application/json")
             .header("webhook-id", &id)
             .header("webhook-timestamp", now.as_second())
-            .header("webhook-signature", sign(&self.secrets, &id, now.as_second(), &payload))
+            .header("webhook-signature", sign(secrets, &id, now.as_second(), &payload))
             .body(payload);
         match request.send().await {
             Ok(answer) => {

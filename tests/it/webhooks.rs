@@ -119,6 +119,23 @@ async fn a_notice_survives_a_kill_and_is_sent_until_it_is_taken() {
 }
 
 #[tokio::test]
+async fn a_tenant_without_secrets_may_not_ask_for_notices() {
+    let folder = tempfile::tempdir().expect("folder");
+    let variables = [
+        ("SHRINKD_WEBHOOKS__SECRETS", format!("{SECRETS:?}")),
+        ("SHRINKD_WEBHOOKS__TENANTS", "{default=[]}".to_owned()),
+    ];
+    let app = App::start_with(folder.path(), &variables.each_ref().map(|(name, value)| (*name, value.as_str())));
+    let mut spec = small();
+    spec["webhook"] = json!({"url": "https://example.com/"});
+    let body = problem(app.post("/v1/jobs", &spec).await, 422, "invalid_request").await;
+    assert_eq!(
+        (&body["errors"][0]["pointer"], &body["errors"][0]["code"]),
+        (&json!("/webhook"), &json!("not_offered"))
+    );
+}
+
+#[tokio::test]
 async fn a_target_inside_the_network_is_refused_at_its_place() {
     let folder = tempfile::tempdir().expect("folder");
     let app = App::start_with(folder.path(), &[("SHRINKD_WEBHOOKS__SECRETS", &format!("{SECRETS:?}"))]);

@@ -2,6 +2,7 @@ use super::*;
 use crate::engine::conformance;
 use crate::engine::sqlite::SqliteEngine;
 use crate::engine::{Outcome, Terms};
+use crate::notify::signature::Secret;
 use crate::tenant::Tenant;
 use std::collections::VecDeque;
 use std::net::Ipv4Addr;
@@ -66,10 +67,21 @@ impl Receiver {
 
 const TAKEN: &str = "HTTP/1.1 204 No Content\r\nconnection: close\r\n\r\n";
 
+/// What all tenants share, and what `acme` has for itself.
+fn secrets() -> [Secret; 2] {
+    ["whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw", "whsec_AAECAwQFBgcICQoLDA0ODxAREhMUFRYX"]
+        .map(|text| Secret::try_from(text.to_owned()).expect("a secret"))
+}
+
+fn tenant(name: &str) -> Tenant {
+    name.parse().expect("a name")
+}
+
 fn courier(names: Arc<dyn Names>, networks: &[&str]) -> Courier {
-    let secret = Secret::try_from("whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw".to_owned()).expect("a secret");
+    let [common, own] = secrets();
     let config = WebhooksConfig {
-        secrets: vec![secret],
+        secrets: vec![common],
+        tenants: [(tenant("acme"), vec![own]), (tenant("none"), Vec::new())].into(),
         allow_http: true,
         ports: Vec::new(),
         allow_private: networks.iter().map(|text| text.parse().expect("a network")).collect(),
@@ -103,6 +115,29 @@ async fn a_notice_is_sent_to_the_address_that_was_checked() {
     assert!(requests[0].contains(&format!("webhook-id: job_{}\r\n", notice.job.id)), "{requests:?}");
     assert!(requests[0].contains("\"type\":\"job.canceled\""), "{requests:?}");
     assert!(requests[0].contains(&format!("https://shrinkd.example/v1/jobs/{}", notice.job.id)), "{requests:?}");
+}
+
+#[tokio::test]
+async fn a_tenants_notices_are_signed_with_its_own_secret_and_with_no_other() {
+    let receiver = Receiver::on(Ipv4Addr::LOCALHOST, 0, TAKEN).await;
+    let courier = courier(Arc::new(SystemNames), &["127.0.0.1/32"]);
+    let [common, own] = secrets();
+    for (name, secret) in [("default", common), ("acme", own)] {
+        let of = DueNotice { tenant: tenant(name), ..notice(format!("http://127.0.0.1:{}/", receiver.port)).await };
+        assert_eq!(courier.attempt(&of).await, Attempt::Taken);
+        let request = receiver.requests().pop().expect("a request");
+        let (head, body) = request.split_once("\r\n\r\n").expect("a body");
+        let header = |name: &str| {
+            let line = head.lines().find_map(|line| line.strip_prefix(name)).expect("the header");
+            line.trim_start_matches(": ").to_owned()
+        };
+        let timestamp = header("webhook-timestamp").parse().expect("seconds");
+        let signed = sign(&[secret], &header("webhook-id"), timestamp, body.as_bytes());
+        assert_eq!(header("webhook-signature"), signed, "{name}");
+    }
+    let of = DueNotice { tenant: tenant("none"), ..notice(format!("http://127.0.0.1:{}/", receiver.port)).await };
+    assert_eq!(courier.attempt(&of).await, Attempt::Failed(None));
+    assert_eq!(receiver.requests().len(), 2, "nothing goes unsigned");
 }
 
 #[tokio::test]
