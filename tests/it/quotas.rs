@@ -1,6 +1,6 @@
 //! What one tenant may have of the service, and that another gets its turn.
 
-use crate::app::{App, problem, small, state};
+use crate::app::{App, endless, problem, small, state};
 use crate::tenants::{ask, eventually, keys};
 use reqwest::{Method, Response, StatusCode};
 use serde_json::{Value, json};
@@ -55,7 +55,7 @@ async fn what_is_over_a_quota_is_refused_and_told() {
     let quotas = [
         ("SHRINKD_QUOTAS__DEFAULT__QUEUED", "1"),
         ("SHRINKD_QUOTAS__DEFAULT__UPLOAD_BYTES_PER_HOUR", "2000"),
-        ("SHRINKD_QUOTAS__DEFAULT__VERTICES_PER_HOUR", "200000"),
+        ("SHRINKD_QUOTAS__DEFAULT__VERTICES_PER_HOUR", "3000000"),
         ("SHRINKD_WORKER__SLOTS", "1"),
     ];
     let app = App::start_with(folder.path(), &quotas);
@@ -63,10 +63,13 @@ async fn what_is_over_a_quota_is_refused_and_told() {
         let request = app.request(Method::POST, "/v1/jobs").header("Idempotency-Key", key).json(body);
         request.send().await.expect("an answer")
     };
-    let estimate: Value = app.post("/v1/jobs?validate_only=true", &slow()).await.json().await.expect("JSON");
-    let left = 200_000 - 2 * estimate["vertices"].as_u64().expect("an estimate");
+    let vertices = async |body: &Value| {
+        let estimate: Value = app.post("/v1/jobs?validate_only=true", body).await.json().await.expect("JSON");
+        estimate["vertices"].as_u64().expect("an estimate")
+    };
+    let left = 3_000_000 - vertices(&endless()).await - vertices(&slow()).await;
     // one that runs, one that waits
-    let running: Value = submit("a", &slow()).await.json().await.expect("JSON");
+    let running: Value = submit("a", &endless()).await.json().await.expect("JSON");
     app.running(running["id"].as_str().expect("a name")).await;
     assert_eq!(submit("b", &slow()).await.status(), StatusCode::ACCEPTED);
     let refused = submit("c", &small()).await;
@@ -80,8 +83,8 @@ async fn what_is_over_a_quota_is_refused_and_told() {
     // there is room again, and not for as many vertices
     let id = again.json::<Value>().await.expect("JSON")["id"].as_str().expect("a name").to_owned();
     app.post(&format!("/v1/jobs/{id}/cancel"), &json!({})).await;
-    let refused = submit("d", &slow()).await;
-    assert_eq!(header(&refused, "ratelimit-policy"), "\"vertices_per_hour\";q=200000;w=3600");
+    let refused = submit("d", &endless()).await;
+    assert_eq!(header(&refused, "ratelimit-policy"), "\"vertices_per_hour\";q=3000000;w=3600");
     let told = header(&refused, "ratelimit");
     assert!(told.starts_with(&format!("\"vertices_per_hour\";r={left};t=")), "{told}");
     problem(refused, 429, "quota_exceeded").await;
@@ -118,7 +121,7 @@ async fn whoever_asks_too_often_is_told_so_and_what_is_left_is_told_before() {
 async fn a_full_queue_takes_no_more_jobs() {
     let folder = tempfile::tempdir().expect("folder");
     let app = App::start_with(folder.path(), &[("SHRINKD_LIMITS__QUEUED_JOBS", "1"), ("SHRINKD_WORKER__SLOTS", "1")]);
-    let running = app.submit(&slow()).await;
+    let running = app.submit(&endless()).await;
     app.running(&running).await;
     app.submit(&slow()).await;
     let refused = app.post("/v1/jobs", &small()).await;
@@ -130,7 +133,7 @@ async fn a_full_queue_takes_no_more_jobs() {
 async fn a_job_is_stopped_at_its_deadline() {
     let folder = tempfile::tempdir().expect("folder");
     let app = App::start_with(folder.path(), &[("SHRINKD_LIMITS__JOB_SECONDS", "100")]);
-    let mut request = crate::app::endless();
+    let mut request = endless();
     request["deadline_s"] = json!(1);
     let id = app.submit(&request).await;
     let job = app.ended(&id).await;
