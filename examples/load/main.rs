@@ -67,9 +67,12 @@ impl Load {
         if self.server.is_some() { "nats" } else { "sqlite" }
     }
 
-    /// Starts a process that is ready to be asked.
+    /// Starts a process that is ready to be asked. Nodes of one folder share their jobs, and nobody else's.
     async fn node(&self, folder: &Path, variables: &[(&'static str, String)]) -> Outcome<Node> {
-        let engine = self.server.as_ref().map_or("sqlite".to_owned(), NatsServer::url);
+        let name = folder.file_name().unwrap_or_default().to_string_lossy();
+        let prefix: String = name.chars().filter(char::is_ascii_alphanumeric).collect();
+        let engine = self.server.as_ref().map(|server| format!("{}?prefix={prefix}", server.url()));
+        let engine = engine.unwrap_or_else(|| "sqlite".to_owned());
         let mut all = vec![("SHRINKD_ENGINE", engine)];
         all.extend_from_slice(variables);
         let node = Node::start(&self.program, folder, &all)?;

@@ -17,10 +17,7 @@ pub async fn measure(load: &Load) -> Outcome<()> {
     for count in 1..=MOST {
         let folder = tempfile::tempdir()?;
         let variables = |role: &str| {
-            let prefix =
-                format!("{}?prefix=LOAD{count}", load.server.as_ref().map(|server| server.url()).unwrap_or_default());
             [
-                ("SHRINKD_ENGINE", prefix),
                 ("SHRINKD_ROLE", role.to_owned()),
                 ("SHRINKD_WORKER__SLOTS", "1".to_owned()),
                 ("SHRINKD_WORKER__THREADS", "1".to_owned()),

@@ -15,7 +15,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 const KIB: u64 = 1 << 10;
 const MIB: u64 = 1 << 20;
 /// What every job takes: the front, tables, outputs.
-const EVERY: u64 = 32 * MIB;
+const EVERY: u64 = 64 * MIB;
 /// A vertex of the result, with its triangles and the files it is written to, and with the charts of the adaptive method.
 const VERTEX: u64 = 1792;
 /// A vertex of the paper's loop.
