@@ -81,7 +81,8 @@ impl Case {
             .or_else(|_| input::open_network(&bytes, &FieldOptions::default()))
             .map_err(|e| said(&e))?;
         let (cancel, tally, field) = (CancelToken::new(), Tally::new(), placed.field());
-        let sampler = Sampler::new(&field, Settings { pool, cancel: &cancel, progress: &|_| {} }, &tally);
+        let sampler =
+            Sampler::new(&field, Settings { pool, cancel: &cancel, progress: &|_| {}, watched: false }, &tally);
         let spec = ShrinkSpec { lattice: LatticeSpec::Octahedral { n: 72 }, ..ShrinkSpec::default() };
         let surface = shrink(&sampler, &spec, None, &Effort::default()).map_err(|e| said(&e))?;
         let places = [0, 1, 2].map(|axis| surface.positions.iter().map(|p| p[axis] as f32).collect());

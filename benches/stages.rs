@@ -117,7 +117,7 @@ fn attempt(
     let marks = Mutex::new(Vec::new());
     let progress = |progress: Progress| marks.lock().unwrap().push((progress.stage, now()));
     let cancel = CancelToken::new();
-    let settings = Settings { pool, cancel: &cancel, progress: &progress };
+    let settings = Settings { pool, cancel: &cancel, progress: &progress, watched: false };
     let tally = Tally::new();
     shrink(&Sampler::new(field, settings, &tally), spec, None, &Effort::default()).map_err(|e| e.to_string())?;
     let mut marks = marks.into_inner().unwrap();

@@ -19,7 +19,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for path in std::env::args().skip(1) {
         let field = open(&std::fs::read(&path)?, &FieldOptions::default())?.field;
         let run = |cancel: &CancelToken| {
-            let settings = Settings { pool: &pool, cancel, progress: &|_| {} };
+            let settings = Settings { pool: &pool, cancel, progress: &|_| {}, watched: false };
             let tally = Tally::new();
             shrink(&Sampler::new(field.as_ref(), settings, &tally), &ShrinkSpec::default(), None, &Effort::default())
                 .is_err()

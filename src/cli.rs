@@ -138,6 +138,9 @@ pub struct ExtractArgs {
     /// Where the picture goes (PNG)
     #[arg(long, value_name = "P.png")]
     pub preview: Option<PathBuf>,
+    /// Where the shrinking in six frames goes (PNG)
+    #[arg(long, value_name = "F.png")]
+    pub filmstrip: Option<PathBuf>,
     /// Where positions, normals, UVs and fundamental forms go (safetensors)
     #[arg(long, value_name = "S.safetensors")]
     pub surface: Option<PathBuf>,

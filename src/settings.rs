@@ -34,13 +34,15 @@ impl CancelToken {
 #[error("canceled")]
 pub struct Canceled;
 
-/// The front while it shrinks, coarse enough to be streamed: at most a few thousand vertices, in scene units.
+/// The front while it shrinks, in scene units.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Front {
     /// Vertex positions in scene units.
     pub positions: Vec<[f32; 3]>,
     /// Counter-clockwise outward triangles, indices into `positions`.
     pub triangles: Vec<[u32; 3]>,
+    /// Place of every vertex on the unit sphere; empty as long as the map onto it is not made.
+    pub places: Vec<[f32; 3]>,
 }
 
 /// One report of how far a computation has come.
@@ -75,4 +77,6 @@ pub struct Settings<'a> {
     pub cancel: &'a CancelToken,
     /// Called with progress, from the thread that runs the computation.
     pub progress: &'a (dyn Fn(Progress) + Sync),
+    /// Whether somebody looks at fronts, also at those that take time to make. It changes no result.
+    pub watched: bool,
 }

@@ -66,7 +66,7 @@ fn animate(args: &AnimateArgs) -> Result<(), (u8, String)> {
         bar.set_position((f64::from(progress.fraction) * total as f64) as u64);
         bar.set_message(progress.stage.to_owned());
     };
-    let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress };
+    let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress, watched: false };
     let open = |code: &[f32]| opened(code).map(|opened| opened.field);
     let path = Path { open: &open, spec: &shrink, budget: args.shrink.budget(), cold: args.cold, settings };
     let (mut frames, mut shapes, mut base) = (Vec::new(), Vec::new(), None::<Surface>);

@@ -46,7 +46,7 @@ fn measured(args: &EvaluateArgs) -> Result<Result<(), Vec<String>>, (u8, String)
     let pool = pool.map_err(|e| (FAILED, e.to_string()))?;
     let cancel = CancelToken::new();
     interrupt::raise_on_signal(&cancel).map_err(|e| (FAILED, e.to_string()))?;
-    let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_| {} };
+    let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_| {}, watched: false };
     let tally = Tally::new();
     let sampler = Sampler::new(field.as_ref(), settings, &tally);
     let vertices = mesh_vertices(&mesh);

@@ -52,7 +52,7 @@ fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
             n => format!("{} (attempt {n})", progress.stage),
         });
     };
-    let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress };
+    let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress, watched: false };
     let mut shrink = ShrinkSpec { samples: args.samples, ..args.shrink.spec(args.lattice) };
     if args.weight.is_some() {
         shrink.density = Density::Weight;
@@ -69,6 +69,9 @@ fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
         Ended::Canceled => (FAILED, "canceled".to_owned()),
     };
     if opened.field.dimension() == 2 {
+        if args.filmstrip.is_some() {
+            return Err((BAD_USAGE, in_field("--filmstrip is for fields of dimension 3")));
+        }
         let svg = args.svg.clone().unwrap_or_else(|| args.output.with_extension("svg"));
         let mut files = wanted(args);
         files.push((OutputName::Svg, svg.clone()));
@@ -144,6 +147,7 @@ fn wanted(args: &ExtractArgs) -> Vec<(OutputName, PathBuf)> {
         (OutputName::Glb, Some(&args.output)),
         (OutputName::Surface, args.surface.as_ref()),
         (OutputName::Preview, args.preview.as_ref()),
+        (OutputName::Filmstrip, args.filmstrip.as_ref()),
         (OutputName::Report, args.report.as_ref()),
     ];
     files.into_iter().filter_map(|(output, path)| Some((output, path?.clone()))).collect()

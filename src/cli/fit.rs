@@ -184,7 +184,7 @@ fn fitted(args: &FitArgs) -> Result<(), (u8, String)> {
         let loss = progress.energy.map_or(String::new(), |loss| format!(" loss {loss:.5}"));
         bar.set_message(format!("{}{loss}", progress.stage));
     };
-    let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress };
+    let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress, watched: false };
     let last = Cell::new(Instant::now());
     let checkpoint = |state: &Checkpoint| {
         let Some(path) = &args.checkpoint else { return };

@@ -54,7 +54,7 @@ fn carried(args: &SensitivityArgs) -> Result<(), (u8, String)> {
     let (surface, gradient) = (read(&args.surface)?, read(&args.gradient)?);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads).build();
     let pool = pool.map_err(|e| (FAILED, e.to_string()))?;
-    let settings = Settings { pool: &pool, cancel: &CancelToken::new(), progress: &|_| {} };
+    let settings = Settings { pool: &pool, cancel: &CancelToken::new(), progress: &|_| {}, watched: false };
     let made = sensitivity_of(&field, &options, &surface, &gradient, &settings).map_err(|ended| {
         let Ended::Failed(failure) = ended else { return (FAILED, "canceled".to_owned()) };
         let path = match failure.code.as_str() {

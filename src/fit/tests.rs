@@ -30,7 +30,7 @@ fn small() -> FitSpec {
 
 fn with_settings<T>(threads: usize, run: impl FnOnce(&Settings<'_>) -> T) -> T {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-    run(&Settings { pool: &pool, cancel: &CancelToken::new(), progress: &|_| {} })
+    run(&Settings { pool: &pool, cancel: &CancelToken::new(), progress: &|_| {}, watched: false })
 }
 
 fn fitted(meshes: &[MeshField], spec: &FitSpec, threads: usize) -> Fitted {

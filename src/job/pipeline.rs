@@ -1,9 +1,11 @@
 //! From bytes to outputs: the one place where the job room meets the numeric rooms.
 
+mod filmstrip;
 mod fitting;
 mod plane;
 mod sensing;
 
+use filmstrip::Film;
 pub use fitting::{Kept, StateBytes, open_mesh, run_fit};
 pub use plane::{CurveMade, make_curve};
 pub use sensing::{Carried, SensitivityReport, run_sensitivity, sensitivity_of};
@@ -225,11 +227,19 @@ impl Clock {
 ///
 /// Every output but the report is the same for the same request, whatever the clock and the number of threads say.
 pub fn make(opened: &Opened, asked: &Asked<'_>, settings: Settings<'_>) -> Result<Made, Ended> {
+    let film = asked.outputs.contains(&OutputName::Filmstrip).then(Film::default);
     let told = |progress: Progress| {
+        if let Some(film) = &film {
+            film.see(&progress);
+        }
         (settings.progress)(Progress { fraction: MEASURED_SHARE * progress.fraction, ..progress });
     };
     let tally = Tally::new();
-    let sampler = Sampler::new(opened.field.as_ref(), Settings { progress: &told, ..settings }, &tally);
+    let sampler = Sampler::new(
+        opened.field.as_ref(),
+        Settings { progress: &told, watched: settings.watched || film.is_some(), ..settings },
+        &tally,
+    );
     let clock = Clock::default();
     let begins = |part| clock.begin(Some(part));
     let (weight, earlier) = (opened.weight.as_deref(), opened.earlier.as_ref());
@@ -257,6 +267,7 @@ pub fn make(opened: &Opened, asked: &Asked<'_>, settings: Settings<'_>) -> Resul
                 return Err(Failure::new("dimension", "the field has the wrong dimension for this", detail).into());
             }
             OutputName::Preview => surface::preview::to_png(&surface, PREVIEW_WIDTH, &settings)?,
+            OutputName::Filmstrip => film.as_ref().map_or(Ok(Vec::new()), |film| film.to_png(&surface, &settings))?,
             OutputName::Report => {
                 report.seconds.write = clock.elapsed().as_secs_f64();
                 pretty(&report)

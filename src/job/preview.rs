@@ -15,7 +15,8 @@ const FINEST_CELLS: u32 = 32;
 /// Body of a `mesh` event.
 ///
 /// `positions` is base64 of `vertices` x 3 unsigned 16-bit little-endian integers q; the coordinate along an axis is
-/// `origin + q * step`. `triangles` is base64 of `faces` x 3 unsigned little-endian integers of `index_bytes` bytes each.
+/// `origin + q * step`. `triangles` is base64 of `faces` x 3 unsigned little-endian integers of `index_bytes` bytes each. `places` is
+/// base64 of `vertices` x 3 signed 16-bit little-endian integers: a triple over 32767 is the vertex's place on the unit sphere.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct MeshPreview {
     /// Number of vertices.
@@ -32,6 +33,9 @@ pub struct MeshPreview {
     pub triangles: String,
     /// Bytes of one index: 2 for at most 65,536 vertices, else 4.
     pub index_bytes: u8,
+    /// Base64 of the vertices' places on the sphere, once the map onto it is made.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub places: Option<String>,
 }
 
 impl MeshPreview {
@@ -76,8 +80,14 @@ impl MeshPreview {
             positions: BASE64_STANDARD.encode(positions),
             triangles: BASE64_STANDARD.encode(triangles),
             index_bytes,
+            places: (!front.places.is_empty()).then(|| BASE64_STANDARD.encode(quantized_places(&front.places))),
         })
     }
+}
+
+fn quantized_places(places: &[[f32; 3]]) -> Vec<u8> {
+    let quantize = |c: &f32| ((c * f32::from(i16::MAX)).round() as i16).to_le_bytes();
+    places.iter().flatten().flat_map(quantize).collect()
 }
 
 /// The front with at most [`MAX_VERTICES`], by merging the vertices in each cell of a cubic grid at their mean; `None` when
@@ -93,13 +103,19 @@ fn coarsened(front: &Front) -> Option<Front> {
     loop {
         let mut vertex_of_cell = HashMap::new();
         let mut sums: Vec<(Vec3, u32)> = Vec::new();
+        let mut places: Vec<Vec3> = Vec::new();
         let merged: Vec<u32> = points
             .iter()
-            .map(|&p| {
+            .enumerate()
+            .map(|(i, &p)| {
                 let cell = ((p - low) * (cells as f32 / extent)).as_uvec3();
                 let vertex = *vertex_of_cell.entry(cell).or_insert(sums.len() as u32);
                 if vertex as usize == sums.len() {
                     sums.push((Vec3::ZERO, 0));
+                    places.push(Vec3::ZERO);
+                }
+                if let Some(&place) = front.places.get(i) {
+                    places[vertex as usize] += Vec3::from(place);
                 }
                 let (sum, count) = &mut sums[vertex as usize];
                 *sum += p;
@@ -116,6 +132,10 @@ fn coarsened(front: &Front) -> Option<Front> {
         return Some(Front {
             positions: sums.iter().map(|&(sum, count)| (sum / count as f32).to_array()).collect(),
             triangles: corners.filter(|[a, b, c]| a != b && b != c && c != a).collect(),
+            places: match front.places.is_empty() {
+                true => Vec::new(),
+                false => places.iter().map(|d| d.normalize_or(Vec3::Z).to_array()).collect(),
+            },
         });
     }
 }
@@ -129,8 +149,12 @@ mod tests {
         let front = Front {
             positions: vec![[0.0, -1.0, 5.0], [0.25, 2.0, 5.0], [1.0, 0.3333, 5.0]],
             triangles: vec![[0, 1, 2]],
+            places: vec![[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.6, 0.0, 0.8]],
         };
         let preview = MeshPreview::new(&front).expect("finite");
+        let places = BASE64_STANDARD.decode(preview.places.as_deref().expect("are there")).expect("base64");
+        let places: Vec<i16> = places.chunks_exact(2).map(|b| i16::from_le_bytes([b[0], b[1]])).collect();
+        assert_eq!(places, [32767, 0, 0, 0, -32767, 0, 19660, 0, 26214]);
         let bytes = BASE64_STANDARD.decode(&preview.positions).expect("base64");
         for (v, p) in front.positions.iter().enumerate() {
             for (axis, original) in p.iter().enumerate() {
@@ -150,10 +174,15 @@ mod tests {
         let front = Front {
             positions: lattice.directions.iter().map(|d| d.as_vec3().to_array()).collect(),
             triangles: lattice.triangles(&vec![false; lattice.quads.len()]),
+            places: lattice.directions.iter().map(|d| d.as_vec3().to_array()).collect(),
         };
         let coarse = coarsened(&front).expect("20,738 vertices are too many");
         assert!((MAX_VERTICES / 4..=MAX_VERTICES).contains(&coarse.positions.len()), "{}", coarse.positions.len());
         assert!(coarse.positions.iter().all(|&p| (Vec3::from(p).length() - 1.0).abs() < 0.02), "on the sphere still");
+        let beside = |(p, d): (&[f32; 3], &[f32; 3])| Vec3::from(*p).dot(Vec3::from(*d)) > 0.99;
+        assert!(
+            coarse.places.len() == coarse.positions.len() && coarse.positions.iter().zip(&coarse.places).all(beside)
+        );
         assert!(coarse.triangles.iter().flatten().all(|&v| (v as usize) < coarse.positions.len()));
         let volume: f32 = coarse
             .triangles
@@ -170,6 +199,9 @@ mod tests {
 
     #[test]
     fn a_front_that_blew_up_is_not_shown() {
-        assert_eq!(MeshPreview::new(&Front { positions: vec![[f32::NAN; 3]], triangles: vec![] }), None);
+        assert_eq!(
+            MeshPreview::new(&Front { positions: vec![[f32::NAN; 3]], triangles: vec![], places: vec![] }),
+            None
+        );
     }
 }

@@ -49,6 +49,8 @@ pub enum OutputName {
     Svg,
     /// The surface from four sides, or the curve, as PNG.
     Preview,
+    /// The shrinking in six frames, as PNG.
+    Filmstrip,
     /// The network that was fitted, as safetensors with its architecture.
     Network,
     /// Derivatives by a latent code and by weights, as safetensors.
@@ -59,11 +61,12 @@ pub enum OutputName {
 
 impl OutputName {
     /// All of them.
-    pub const ALL: [OutputName; 7] = [
+    pub const ALL: [OutputName; 8] = [
         OutputName::Glb,
         OutputName::Surface,
         OutputName::Svg,
         OutputName::Preview,
+        OutputName::Filmstrip,
         OutputName::Network,
         OutputName::Sensitivity,
         OutputName::Report,
@@ -71,9 +74,9 @@ impl OutputName {
 
     /// Those that jobs of a kind can make.
     pub fn of(kind: JobKind) -> &'static [OutputName] {
-        use OutputName::{Glb, Network, Preview, Report, Sensitivity, Surface, Svg};
+        use OutputName::{Filmstrip, Glb, Network, Preview, Report, Sensitivity, Surface, Svg};
         match kind {
-            JobKind::Shrink => &[Glb, Surface, Svg, Preview, Report],
+            JobKind::Shrink => &[Glb, Surface, Svg, Preview, Filmstrip, Report],
             JobKind::Fit => &[Network, Report],
             JobKind::Sensitivity => &[Sensitivity, Report],
         }
@@ -86,6 +89,7 @@ impl OutputName {
             OutputName::Surface => "surface",
             OutputName::Svg => "svg",
             OutputName::Preview => "preview",
+            OutputName::Filmstrip => "filmstrip",
             OutputName::Network => "network",
             OutputName::Sensitivity => "sensitivity",
             OutputName::Report => "report",
@@ -102,7 +106,7 @@ impl OutputName {
             // no registered type; the one the format's own tools use is octet-stream
             OutputName::Surface | OutputName::Network | OutputName::Sensitivity => "application/octet-stream",
             OutputName::Svg => "image/svg+xml",
-            OutputName::Preview => "image/png",
+            OutputName::Preview | OutputName::Filmstrip => "image/png",
             OutputName::Report => "application/json",
         }
     }
@@ -112,7 +116,7 @@ impl OutputName {
             OutputName::Glb => "glb",
             OutputName::Surface | OutputName::Network | OutputName::Sensitivity => "safetensors",
             OutputName::Svg => "svg",
-            OutputName::Preview => "png",
+            OutputName::Preview | OutputName::Filmstrip => "png",
             OutputName::Report => "json",
         }
     }
@@ -347,6 +351,11 @@ impl JobSpec {
                     code: "dimension",
                     detail: detail.to_owned(),
                 }]);
+            }
+            let listed = request.get("outputs").and_then(Value::as_array).map(Vec::as_slice).unwrap_or_default();
+            if let Some(i) = listed.iter().position(|name| name == OutputName::Filmstrip.name()) {
+                let detail = "a filmstrip is made of fields of dimension 3, and this one has dimension 2".to_owned();
+                return Err(vec![Fault { pointer: format!("/outputs/{i}"), code: "dimension", detail }]);
             }
             if request.get("outputs").is_none() {
                 self.outputs.push(OutputName::Svg);

@@ -12,7 +12,7 @@ pub(crate) use super::sampling::Splitmix;
 pub(crate) fn with_settings<R>(threads: usize, f: impl FnOnce(&Settings<'_>) -> R) -> R {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
     let cancel = CancelToken::new();
-    f(&Settings { pool: &pool, cancel: &cancel, progress: &|_| {} })
+    f(&Settings { pool: &pool, cancel: &cancel, progress: &|_| {}, watched: false })
 }
 
 /// A lat-long sphere as a bare mesh.

@@ -124,14 +124,16 @@ fn one(
     stage("contract", 0.0, None, None, None);
     let front = contract(scene, attempt.resolution, places)?;
     let frame = front.frame;
-    let show = |positions: &[DVec3], triangles: Vec<[u32; 3]>| Front {
+    let show = |positions: &[DVec3], triangles: Vec<[u32; 3]>, places: &[DVec3]| Front {
         positions: positions.iter().map(|&p| frame.to_scene(p).as_vec3().to_array()).collect(),
         triangles,
+        places: places.iter().map(|d| d.as_vec3().to_array()).collect(),
     };
-    stage("remesh", 0.25, Some(show(&front.mesh.positions, front.mesh.rings.triangles())), None, None);
+    let on_lattice = |at: &OnZero, triangles| show(&at.positions, triangles, &lattice.directions);
+    stage("remesh", 0.25, Some(show(&front.mesh.positions, front.mesh.rings.triangles(), &[])), None, None);
     let sampler = scene.framed(frame);
     let mesh = base(front, (attempt.fineness * base_vertices(lattice)) as usize, &sampler)?;
-    stage("map", 0.45, Some(show(&mesh.positions, mesh.rings.triangles())), None, None);
+    stage("map", 0.45, Some(show(&mesh.positions, mesh.rings.triangles(), &[])), None, None);
     let mut sampling = sampling(&mesh, scene, frame, spec, weight)?;
     let wanting: Vec<DVec3> = places.iter().map(|&p| frame.from_scene(p)).collect();
     denser_at(&mesh, &wanting, attempt.insist, &mut sampling.density);
@@ -154,6 +156,8 @@ fn one(
     };
     stage("resample", 0.75, None, Some(map.energy), None);
     let mut landing = Landing::new(&mesh, &map, lattice, &settings)?;
+    let mapped = show(&mesh.positions, mesh.rings.triangles(), &landing.directions);
+    stage("resample", 0.76, Some(mapped), Some(map.energy), None);
     for round in 1..=attempt.denser {
         let base = Base { mesh: &mesh, directions: &landing.directions };
         let missed = missed(&base, lattice, &landing.positions, settings.cancel)?;
@@ -161,7 +165,7 @@ fn one(
             break;
         }
         map = settled(&mesh, map.directions, &sampling, objective, &settings)?;
-        stage("resample", 0.75 + 0.02 * round as f32, None, Some(map.energy), None);
+        stage("resample", 0.76 + 0.02 * round as f32, None, Some(map.energy), None);
         landing = Landing::new(&mesh, &map, lattice, &settings)?;
     }
     let Landing { directions, positions: landed, normals } = landing;
@@ -173,16 +177,16 @@ fn one(
     let triangles = lattice.triangles(&diagonals);
     let tangle = Tangle::new(&sampler, &triangles, &at.positions);
     let folds = tangle.relax_patches(&mut at, &landed, 2)?;
-    stage("slide", 0.92, Some(show(&at.positions, triangles.clone())), None, Some(folds as u64));
+    stage("slide", 0.92, Some(on_lattice(&at, triangles.clone())), None, Some(folds as u64));
     let moved = slide(&sampler, lattice, &triangles, &mut at, edge)?;
     turn_diagonals(&sampler, lattice, &at, &mut diagonals, &moved)?;
     let triangles = lattice.triangles(&diagonals);
-    stage("sharpen", 0.95, Some(show(&at.positions, triangles)), None, Some(folds as u64));
+    stage("sharpen", 0.95, Some(on_lattice(&at, triangles)), None, Some(folds as u64));
     let blunt = at.positions.clone();
     let base = Base { mesh: &mesh, directions: &directions };
     let diagonals = sharpen(&sampler, &base, lattice, &mut at, diagonals)?;
     let triangles = lattice.triangles(&diagonals);
-    stage("separate", 0.97, Some(show(&at.positions, triangles)), None, Some(folds as u64));
+    stage("separate", 0.97, Some(on_lattice(&at, triangles)), None, Some(folds as u64));
     let to_scene = |list: &[DVec3]| -> Vec<DVec3> { list.iter().map(|&p| frame.to_scene(p)).collect() };
     let mut wrap = Wrap {
         lattice: lattice.clone(),

@@ -315,7 +315,7 @@ mod tests {
     fn count(positions: &[DVec3], triangles: &[[u32; 3]]) -> usize {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
         let cancel = CancelToken::new();
-        let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_| {} };
+        let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_| {}, watched: false };
         let all: Vec<u32> = (0..triangles.len() as u32).collect();
         crossings(&Index::new(positions, triangles), positions, triangles, &all, &settings).unwrap().len()
     }
@@ -347,7 +347,7 @@ mod tests {
         positions[40] *= -1.2;
         let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
         let cancel = CancelToken::new();
-        let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_| {} };
+        let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_| {}, watched: false };
         let index = Index::new(&positions, &triangles);
         let ask = |list: &[u32]| crossings(&index, &positions, &triangles, list, &settings).unwrap();
         let all = ask(&(0..triangles.len() as u32).collect::<Vec<_>>());

@@ -6,7 +6,7 @@ use super::graded::Graded;
 use super::rings::{Mesh, Rings};
 use super::{ShrinkError, topology};
 use crate::field::{Frame, Metric, Sampler};
-use crate::settings::{CancelToken, Canceled};
+use crate::settings::{self as shown, CancelToken, Canceled, Progress};
 use glam::DVec3;
 use rayon::prelude::*;
 use std::collections::HashMap;
@@ -133,7 +133,14 @@ pub fn contract(scene: &Sampler<'_>, resolution: Resolution, places: &[DVec3]) -
     loop {
         let complex = grid.complex(&settings)?;
         let Marked { target, walls, gaps, narrow } = mark(&sampler, &grid, &complex)?;
-        let inside = carve(&complex, &target, settings.cancel)?;
+        let inside = carve(&complex, &target, settings.cancel, &mut |inside, level| {
+            if settings.watched {
+                let (positions, triangles) = boundary(&complex, &grid.values, inside, level, &HashMap::new());
+                let positions = positions.iter().map(|&p| frame.to_scene(p).as_vec3().to_array()).collect();
+                let front = Some(shown::Front { positions, triangles, places: Vec::new() });
+                (settings.progress)(Progress { stage: "contract", front, ..Progress::default() });
+            }
+        })?;
         let limit = (OBSTRUCTION * h) as f32;
         let stuck = |i: usize| inside[i] && target[i] > 0.0;
         let far: Vec<bool> = (0..complex.len()).map(|i| inside[i] && target[i] > limit).collect();
@@ -160,7 +167,10 @@ pub fn contract(scene: &Sampler<'_>, resolution: Resolution, places: &[DVec3]) -
         }
         let walls = walls.into_iter().filter(|&(i, _)| inside[i]);
         let moved = embedded(&complex, walls.chain(gaps.into_iter().filter(|&(i, _)| !inside[i])).collect());
-        let mesh = extract(&complex, &grid.values, &inside, &moved, settings.cancel)?;
+        settings.cancel.check()?;
+        let (positions, triangles) = boundary(&complex, &grid.values, &inside, 0.0, &moved);
+        let rings = Rings::new(positions.len(), &triangles).expect("the front of a carved ball is a closed manifold");
+        let mesh = Mesh { positions, rings };
         return Ok(Front { mesh, frame });
     }
 }
@@ -324,8 +334,15 @@ fn volume([a, b, c, d]: [DVec3; 4]) -> f64 {
 }
 
 /// Gives up simple nodes with a positive value, farthest outside first, starting from the outermost layer. Returns which
-/// nodes stay inside.
-pub(super) fn carve(complex: &Complex, values: &[f32], cancel: &CancelToken) -> Result<Vec<bool>, Canceled> {
+/// nodes stay inside. On the way `watch` sees a few times which nodes are left, and the value above which most are gone.
+pub(super) fn carve(
+    complex: &Complex,
+    values: &[f32],
+    cancel: &CancelToken,
+    watch: &mut dyn FnMut(&[bool], f32),
+) -> Result<Vec<bool>, Canceled> {
+    /// Shares of the largest value at which it is called.
+    const LEVELS: [f32; 6] = [1.0, 0.6, 0.35, 0.2, 0.1, 0.04];
     /// Buckets that positive values are sorted into; within a bucket the order is that of arrival.
     const BUCKETS: usize = 4096;
     let mut inside: Vec<bool> = complex.border.iter().map(|b| !b).collect();
@@ -341,7 +358,11 @@ pub(super) fn carve(complex: &Complex, values: &[f32], cancel: &CancelToken) -> 
         }
     }
     let (mut current, mut popped) = (BUCKETS - 1, 0u64);
+    let mut levels = LEVELS.into_iter().map(|share| top * share).peekable();
     loop {
+        while let Some(level) = levels.next_if(|&level| current <= bucket(level)) {
+            watch(&inside, level);
+        }
         let Some(i) = queue[current].pop() else {
             if current == 0 {
                 return Ok(inside);
@@ -372,23 +393,21 @@ pub(super) fn carve(complex: &Complex, values: &[f32], cancel: &CancelToken) -> 
     }
 }
 
-/// Marching tetrahedra. Nodes in `moved` stand at another place.
-fn extract(
+/// The surface between the nodes that are inside and the others, where the values cross `level`, by marching tetrahedra. Nodes in
+/// `moved` stand at another place.
+fn boundary(
     complex: &Complex,
     values: &[f32],
     inside: &[bool],
+    level: f32,
     moved: &HashMap<usize, DVec3>,
-    cancel: &CancelToken,
-) -> Result<Mesh, Canceled> {
+) -> (Vec<DVec3>, Vec<[u32; 3]>) {
     /// An edge's vertex keeps this share of the edge from either end, so that no triangle vanishes.
     const EDGE: f64 = 0.05;
     let mut numbers: HashMap<(u32, u32), u32> = HashMap::new();
     let (mut positions, mut triangles) = (Vec::new(), Vec::<[u32; 3]>::new());
     let place = |v: u32| moved.get(&(v as usize)).copied().unwrap_or(complex.positions[v as usize]);
-    for (n, &tet) in complex.tets.iter().enumerate() {
-        if n.is_multiple_of(1 << 16) {
-            cancel.check()?;
-        }
+    for &tet in &complex.tets {
         let solid = tet.iter().filter(|&&v| inside[v as usize]).count();
         if solid == 0 || solid == 4 {
             continue;
@@ -406,7 +425,7 @@ fn extract(
         }
         let mut vertex = |a: u32, b: u32| -> u32 {
             *numbers.entry((a, b)).or_insert_with(|| {
-                let (sa, sb) = (f64::from(values[a as usize]), f64::from(values[b as usize]));
+                let (sa, sb) = (f64::from(values[a as usize] - level), f64::from(values[b as usize] - level));
                 let t = if sa <= 0.0 && sb > 0.0 {
                     (sa / (sa - sb)).clamp(EDGE, 1.0 - EDGE)
                 } else if sa > 0.0 {
@@ -436,8 +455,7 @@ fn extract(
             triangles.push(t);
         }
     }
-    let rings = Rings::new(positions.len(), &triangles).expect("the front of a carved ball is a closed manifold");
-    Ok(Mesh { positions, rings })
+    (positions, triangles)
 }
 
 #[cfg(test)]

@@ -33,6 +33,23 @@ impl Default for LatticeSpec {
 }
 
 impl LatticeSpec {
+    /// The place in the UV square of a direction of length 1.
+    pub fn place(self, direction: DVec3) -> [f64; 2] {
+        match self {
+            LatticeSpec::Latlong { .. } => {
+                let turns = direction.y.atan2(direction.x) / (2.0 * PI);
+                [turns.rem_euclid(1.0), direction.z.clamp(-1.0, 1.0).acos() / PI]
+            }
+            LatticeSpec::Octahedral { .. } => {
+                // the inverse of octahedral_direction
+                let r = (1.0 - direction.z.abs()).max(0.0).sqrt();
+                let b = r * direction.y.abs().atan2(direction.x.abs()) * 2.0 / PI;
+                let (a, b) = if direction.z >= 0.0 { (r - b, b) } else { (1.0 - b, 1.0 - (r - b)) };
+                [0.5 + 0.5 * a.copysign(direction.x), 0.5 - 0.5 * b.copysign(direction.y)]
+            }
+        }
+    }
+
     /// Number of welded vertices.
     pub fn vertices(self) -> u64 {
         match self {
@@ -238,6 +255,22 @@ mod tests {
             let [a, b, c] = t.map(|v| lattice.uv[v as usize]);
             let area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
             assert!(area < 0.0, "v is downwards, so counter-clockwise from outside is negative: {t:?} {area}");
+        }
+    }
+
+    #[test]
+    fn a_direction_has_the_place_that_the_chart_gives_it() {
+        for spec in [LatticeSpec::Latlong { n_theta: 20, n_phi: 10 }, LatticeSpec::Octahedral { n: 9 }] {
+            let lattice = SphereLattice::new(spec);
+            for (&v, &[u, v_down]) in lattice.chart.iter().zip(&lattice.uv) {
+                let [found_u, found_v] = spec.place(lattice.directions[v as usize]);
+                // a seam has two places, and a pole one in every sector
+                let on_border = [u, v_down].iter().any(|c| *c == 0.0 || *c == 1.0);
+                assert!(
+                    on_border || ((found_u - u).abs() < 1e-6 && (found_v - v_down).abs() < 1e-6),
+                    "{spec:?}: {found_u} {found_v} for {u} {v_down}"
+                );
+            }
         }
     }
 

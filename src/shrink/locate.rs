@@ -138,7 +138,7 @@ mod tests {
         let found = |threads: usize| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             let cancel = CancelToken::new();
-            let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_: Progress| {} };
+            let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_: Progress| {}, watched: false };
             locate(&mesh, &base.directions, &queries, &settings).unwrap()
         };
         let places = found(1);

@@ -44,6 +44,7 @@ pub fn run(scene: &Sampler<'_>, spec: &ShrinkSpec) -> Result<Wrap, ShrinkError> 
         let front = (iteration % 5 == 0).then(|| Front {
             positions: positions.iter().map(|&p| frame.to_scene(p).as_vec3().to_array()).collect(),
             triangles: triangles.clone(),
+            places: lattice.directions.iter().map(|d| d.as_vec3().to_array()).collect(),
         });
         (settings.progress)(Progress {
             stage: "shrink",

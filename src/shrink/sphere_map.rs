@@ -407,7 +407,7 @@ mod tests {
     pub(super) fn map(mesh: &Mesh, objective: Objective, threads: usize) -> (Vec<DVec3>, Descent) {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let cancel = CancelToken::new();
-        let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_: Progress| {} };
+        let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_: Progress| {}, watched: false };
         let sampling = Sampling::even(mesh.positions.len());
         let rough = sphere_map(mesh, &sampling, objective, &settings).unwrap().expect("a map");
         descended(mesh, rough, &sampling, objective, &settings).unwrap()

@@ -50,12 +50,14 @@ pub fn warm(scene: &Sampler<'_>, earlier: &Earlier) -> Result<Option<Wrap>, Canc
     // no quad is free to turn
     let lattice = SphereLattice { free: vec![false; earlier.lattice.quads.len()], ..earlier.lattice.clone() };
     let triangles = lattice.triangles(&earlier.diagonals);
+    let directions: Vec<[f32; 3]> = lattice.directions.iter().map(|d| d.as_vec3().to_array()).collect();
     let frame = frame_of(&earlier.positions);
     let stage = |name: &'static str, done: f32, front: Option<&[DVec3]>, flips: Option<u64>| {
         scene.tally().stage(name);
         let show = |places: &[DVec3]| Front {
             positions: places.iter().map(|&p| frame.to_scene(p).as_vec3().to_array()).collect(),
             triangles: triangles.clone(),
+            places: directions.clone(),
         };
         let front = front.map(show);
         (scene.settings().progress)(Progress { stage: name, fraction: done, front, flips, ..Progress::default() });

@@ -63,6 +63,17 @@ pub fn one_view(
     Ok(tiled(&[picture], 1))
 }
 
+/// Models side by side as one PNG, each `side` pixels wide, all from the same place: one from which `whole` fills the picture.
+///
+/// # Errors
+/// When the token is raised.
+pub fn row(models: &[Model<'_>], whole: &[Vec3], side: usize, settings: &Settings<'_>) -> Result<Vec<u8>, Canceled> {
+    let camera = Camera::around(whole, AZIMUTHS[0].to_radians(), ELEVATIONS[0].to_radians());
+    let render = |model: &Model<'_>| render_mesh(*model, &camera, side, OVERSAMPLING, settings);
+    let views: Vec<Picture> = models.iter().map(render).collect::<Result<_, _>>()?;
+    Ok(tiled(&views, models.len()))
+}
+
 /// Pictures of one size side by side, `columns` to a row.
 fn tiled(views: &[Picture], columns: usize) -> Vec<u8> {
     let side = views[0].side;

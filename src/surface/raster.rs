@@ -6,6 +6,7 @@
 
 use super::checkerboard::{Tiles, color};
 use crate::settings::{Canceled, Settings};
+use crate::shrink::lattice::LatticeSpec;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
@@ -14,6 +15,8 @@ use rayon::prelude::*;
 pub enum Paint<'a> {
     /// The checkerboard over texture coordinates, one pair per vertex.
     Checkerboard(&'a [[f32; 2]], Tiles),
+    /// The checkerboard of a lattice's chart over places on the unit sphere, one per vertex.
+    Places(&'a [Vec3], LatticeSpec),
     /// One colour per vertex.
     Vertices(&'a [[f32; 3]]),
     /// One colour.
@@ -233,6 +236,11 @@ fn look(model: Model<'_>, triangle: [u32; 3], weights: Vec3, front: bool) -> Loo
         _ if !front => BEHIND,
         Paint::Plain(c) => c,
         Paint::Vertices(colors) => mix(triangle.map(|v| Vec3::from(colors[v as usize]))).to_array(),
+        Paint::Places(places, spec) => {
+            let place = mix(triangle.map(|v| places[v as usize])).normalize_or(Vec3::Z);
+            let [u, v] = spec.place(place.as_dvec3());
+            color(u as f32, v as f32, Tiles::of(spec))
+        }
         Paint::Checkerboard(uv, tiles) => {
             let place = mix(triangle.map(|v| Vec3::new(uv[v as usize][0], uv[v as usize][1], 0.0)));
             color(place.x, place.y, tiles)

@@ -72,7 +72,7 @@ pub fn run(shape: &Shape, task: &Task<'_>, add: Add<'_>) -> Result<(), Ended> {
     let watch = Arc::new(Watch::default());
     let opened = open(shape, &watch).map_err(Ended::Unread)?;
     let load = clock.elapsed().as_secs_f64();
-    let settings = Settings { pool: task.pool, cancel: task.stop, progress: &|_| {} };
+    let settings = Settings { pool: task.pool, cancel: task.stop, progress: &|_| {}, watched: false };
     let tally = Tally::new();
     let sampler = Sampler::new(opened.field.as_ref(), settings, &tally);
     let mut beside = Beside::new(&sampler);
@@ -145,7 +145,7 @@ fn wrapped(
     watch.pause(false);
     let asked = Asked { shrink: &spec, budget: task.budget, outputs, load_seconds: load };
     let made = guarded(task, &|cancel| {
-        let settings = Settings { pool: task.pool, cancel, progress: &progress };
+        let settings = Settings { pool: task.pool, cancel, progress: &progress, watched: false };
         pipeline::make(opened, &asked, settings)
     });
     watch.pause(true);

@@ -126,7 +126,9 @@ pub fn make_curve(opened: &Opened, asked: &Asked<'_>, settings: Settings<'_>) ->
             OutputName::Surface => surface::curve::to_safetensors(&curve),
             OutputName::Svg => surface::curve::to_svg(&curve).into_bytes(),
             OutputName::Preview => surface::curve::to_png(&curve, PICTURE, &settings)?,
-            OutputName::Network | OutputName::Sensitivity => return Err(Failure::internal().into()),
+            OutputName::Network | OutputName::Sensitivity | OutputName::Filmstrip => {
+                return Err(Failure::internal().into());
+            }
             OutputName::Report => {
                 report.seconds.write = clock.elapsed().as_secs_f64();
                 pretty(&report)

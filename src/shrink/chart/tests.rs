@@ -7,7 +7,7 @@ const SPECS: [LatticeSpec; 2] = [LatticeSpec::Latlong { n_theta: 48, n_phi: 24 }
 fn with_settings<R>(threads: usize, f: impl FnOnce(&Settings<'_>) -> R) -> R {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
     let cancel = CancelToken::new();
-    f(&Settings { pool: &pool, cancel: &cancel, progress: &|_| {} })
+    f(&Settings { pool: &pool, cancel: &cancel, progress: &|_| {}, watched: false })
 }
 
 /// A bent club: a limb that the sphere's own chart gives little room.

@@ -11,7 +11,7 @@ use std::f64::consts::TAU;
 fn shrunk(field: &dyn Field, spec: &CurveSpec, threads: usize) -> Result<(Curve, CurveReport), ShrinkError> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
     let (cancel, tally) = (CancelToken::new(), Tally::new());
-    let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_| {} };
+    let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_| {}, watched: false };
     let sampler = Sampler::new(field, settings, &tally);
     let curve = shrink_curve(&sampler, spec, &Effort::default())?;
     let options = ShrinkSpec { method: spec.method, ..ShrinkSpec::default() };
@@ -247,7 +247,7 @@ fn a_raised_token_ends_the_run() {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let (cancel, tally) = (CancelToken::new(), Tally::new());
     cancel.cancel();
-    let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_| {} };
+    let settings = Settings { pool: &pool, cancel: &cancel, progress: &|_| {}, watched: false };
     let scene = example("disc");
     let found = shrink_curve(&Sampler::new(&scene, settings, &tally), &CurveSpec::default(), &Effort::default());
     assert_eq!(found, Err(ShrinkError::Canceled(Canceled)));
