@@ -21,6 +21,7 @@ pub mod problem;
 pub mod query;
 pub mod rates;
 pub mod server;
+mod web;
 
 pub use problem::Problem;
 
@@ -64,6 +65,8 @@ pub struct App {
     pub webhooks: Arc<WebhooksConfig>,
     /// How often tenants may ask this node.
     pub rates: Arc<Rates>,
+    /// Room for uploads.
+    pub upload_room: body::Room,
     /// Raised when the service stops.
     pub stop: CancellationToken,
 }
@@ -88,6 +91,7 @@ fn api() -> OpenApiRouter<App> {
         .routes(routes!(metrics::metrics))
         // for a person
         .routes(routes!(page::page))
+        .routes(routes!(page::plain))
 }
 
 /// The description of the service, as it is pinned in `openapi.yaml`.
@@ -119,6 +123,7 @@ pub fn router(
     let (router, _) = api().split_for_parts();
     let door = Door { authenticator, rates: app.rates.clone() };
     let mut router = router
+        .merge(web::routes())
         .fallback(problem::unknown_route)
         .method_not_allowed_fallback(problem::wrong_method)
         .with_state(app)

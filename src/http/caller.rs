@@ -1,14 +1,14 @@
 //! Who asks.
 //!
 //! The [`identify`] layer finds out who sends a request and puts a [`Caller`] into its extensions, where handlers of every protocol
-//! find it. Whoever is not known is refused there, on every route but the few in `OPEN`; a handler that takes a `Caller` cannot be
+//! find it. Whoever is not known is refused there, on every route but the few in `OPEN` and the files of the page; a handler that takes a `Caller` cannot be
 //! reached without one, and comes to a tenant only by saying what it is about to do ([`Caller::may`]).
 //!
 //! A key or token comes in the header `Authorization: Bearer` (RFC 6750, section 2.1) and nowhere else: a query would be logged, by
 //! proxies too, and a form would be sent from other sites.
 
-use super::Problem;
 use super::rates::{Rate, Rates};
+use super::{Problem, web};
 use crate::auth::{Authenticator, Caller, NotAllowed, Refused};
 use axum::extract::{FromRequestParts, Request, State};
 use axum::http::request::Parts;
@@ -61,7 +61,9 @@ pub struct Door {
 /// Puts the [`Caller`] into the request, or refuses it; so it does when the caller's tenant asks too often.
 pub async fn identify(State(door): State<Door>, mut request: Request, next: Next) -> Response {
     // nothing from outside brings extensions along: one that is there was put there by this program
-    if request.extensions().get::<Caller>().is_none() && !OPEN.contains(&request.uri().path()) {
+    let path = request.uri().path();
+    let open = OPEN.contains(&path) || web::is_open(path);
+    if request.extensions().get::<Caller>().is_none() && !open {
         let caller = match &door.authenticator {
             None => Caller::anybody(),
             Some(authenticator) => match ask(authenticator, request.headers()).await {

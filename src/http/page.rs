@@ -1,12 +1,13 @@
-//! `/`: the newest jobs for a person, without scripts and without anything from another host.
+//! `/`: the page for a person. Where it was not built into the program, and at `/plain`: the newest jobs, without scripts and without
+//! anything from another host.
 
-use super::{App, Problem};
+use super::{App, Problem, web};
 use crate::auth::{Caller, Scope};
 use crate::engine::ListQuery;
 use crate::job::Job;
 use axum::extract::State;
-use axum::http::header;
-use axum::response::{Html, IntoResponse};
+use axum::http::{HeaderMap, header};
+use axum::response::{Html, IntoResponse, Response};
 use std::fmt::Write as _;
 
 /// Jobs on the page.
@@ -14,20 +15,36 @@ const SHOWN: usize = 30;
 /// Nothing may run, and nothing may come from elsewhere.
 const POLICY: &str =
     "default-src 'none'; img-src 'self'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'";
-const HEAD: &str = "<!doctype html><html lang=en><meta charset=utf-8><meta http-equiv=refresh content=5><title>shrinkd</title>\
+const HEAD: &str = "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content=\"width=device-width\"><meta http-equiv=refresh content=5><title>shrinkd</title>\
 <style>body{font:15px system-ui;margin:2rem auto;max-width:60rem;padding:0 1rem}table{border-collapse:collapse;width:100%}\
 td,th{text-align:left;padding:.4rem;border-top:1px solid #ccc;vertical-align:middle}img{height:6rem}code{font-size:85%}</style>\
-<h1>shrinkd</h1><p>The newest jobs. The interface is described in <a href=/openapi.json>openapi.json</a>.</p>\
+<h1>shrinkd</h1><p>The newest jobs. The interface is described at <a href=/docs/>/docs</a>.</p>\
 <table><tr><th>preview<th>job<th>state<th>progress<th>outputs";
 
-/// The newest jobs, for a person
+/// The page for a person
+///
+/// Where it was not built into the program this is the same as `/plain`.
 #[utoipa::path(
     get,
     path = "/",
     tag = "operation",
     responses((status = 200, description = "a page", content_type = "text/html", body = String))
 )]
-pub async fn page(State(app): State<App>, caller: Caller) -> Result<impl IntoResponse, Problem> {
+pub async fn page(state: State<App>, caller: Result<Caller, Problem>, headers: HeaderMap) -> Result<Response, Problem> {
+    match web::index(&headers) {
+        Some(page) => Ok(page),
+        None => Ok(plain(state, caller?).await?.into_response()),
+    }
+}
+
+/// The newest jobs, for a person without scripts
+#[utoipa::path(
+    get,
+    path = "/plain",
+    tag = "operation",
+    responses((status = 200, description = "a page", content_type = "text/html", body = String))
+)]
+pub async fn plain(State(app): State<App>, caller: Caller) -> Result<impl IntoResponse + use<>, Problem> {
     let tenant = caller.may(Scope::Read)?;
     let newest = ListQuery { limit: SHOWN, ..ListQuery::default() };
     let page = app.engine.list(tenant, newest).await?;
