@@ -3,6 +3,8 @@
 //! In variables a level is two underscores: `SHRINKD_WORKER__SLOTS=4`. Unknown names are refused, in the file and in the
 //! environment. The defaults need nothing: one folder, loopback only.
 
+mod warnings;
+
 use crate::engine::nats::{Address, InvalidAddress};
 use crate::job::memory;
 use crate::notify::signature::Secret;
@@ -41,6 +43,8 @@ pub struct Config {
     pub download_link_s: u64,
     /// What this node does (`SHRINKD_ROLE`).
     pub role: Role,
+    /// Seconds for which a node still answers after SIGTERM (`SHRINKD_DRAIN_S`): that it is not ready, and that it takes no more jobs.
+    pub drain_s: u64,
     /// Who may ask.
     pub auth: AuthConfig,
     /// Sizes of requests, and what jobs may take.
@@ -162,6 +166,8 @@ pub struct Limits {
     pub body_bytes: u64,
     /// Bytes of an uploaded input (`SHRINKD_LIMITS__INPUT_BYTES`): 256 MiB, held in memory while it is checked.
     pub input_bytes: u64,
+    /// Bytes of the uploads that a node reads at the same time (`SHRINKD_LIMITS__UPLOAD_BYTES`): 1 GiB.
+    pub upload_bytes: u64,
     /// Jobs that may wait, over all tenants (`SHRINKD_LIMITS__QUEUED_JOBS`): 0 is no limit.
     pub queued_jobs: u64,
     /// Seconds that an attempt at a job may run (`SHRINKD_LIMITS__JOB_SECONDS`).
@@ -248,11 +254,13 @@ impl Default for Config {
             blobs: FOLDER.to_owned(),
             download_link_s: 0,
             role: Role::All,
+            drain_s: 1,
             auth: AuthConfig::default(),
             retention: Retention { outputs_s: 0, inputs_s: 7 * 24 * 3600, every_s: 3600 },
             limits: Limits {
                 body_bytes: 1 << 20,
                 input_bytes: 256 << 20,
+                upload_bytes: 1 << 30,
                 queued_jobs: 100_000,
                 job_seconds: 3600,
                 job_bytes: 0,
@@ -274,6 +282,16 @@ pub const FOLDER: &str = "folder";
 /// Variables of the project that are no settings of the service: test data, the renewal of stored metrics, and servers
 /// that tests start.
 const NOT_SETTINGS: [&str; 4] = ["DATA", "RENEW_METRICS", "NATS_SERVER", "MOTO_SERVER"];
+
+/// A balancer that has not looked for so long is not looking.
+const MAX_DRAIN_S: u64 = 300;
+/// The longest that S3 signs a link for: a week.
+const MAX_LINK_S: u64 = 7 * 24 * 3600;
+
+/// Whether it is what browsers send in `Origin`: scheme, host and port, and nothing after them.
+fn is_origin(text: &str) -> bool {
+    url::Url::parse(text).is_ok_and(|url| url.origin().is_tuple() && url.origin().ascii_serialization() == text)
+}
 
 impl Config {
     /// Reads the configuration; `flags` are what the command line says.
@@ -301,6 +319,16 @@ impl Config {
             ),
             (config.limits.body_bytes == 0 || config.limits.input_bytes == 0, "limits of bytes must be at least 1"),
             (config.limits.job_seconds == 0, "limits.job_seconds must be at least 1"),
+            (config.drain_s > MAX_DRAIN_S, "drain_s must be at most 300"),
+            (config.download_link_s > MAX_LINK_S, "download_link_s must be at most 604800: no store signs for longer"),
+            (
+                !config.auth.oidc.issuer.is_empty() && config.auth.oidc.algorithms.is_empty(),
+                "auth.oidc.algorithms must name an algorithm",
+            ),
+            (
+                !config.cors_origins.iter().all(|origin| is_origin(origin)),
+                "cors_origins are like https://pages.example or http://127.0.0.1:3000, without a path",
+            ),
         ];
         if let Some((_, why)) = wrong.iter().find(|(is_wrong, _)| *is_wrong) {
             return Err(ConfigError::Impossible(why));

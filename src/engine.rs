@@ -40,12 +40,14 @@ pub struct Terms {
     pub queue: u64,
     /// What each tenant may have.
     pub quotas: Arc<Quotas>,
+    /// Bytes of the largest request that is accepted.
+    pub request_bytes: u64,
 }
 
 impl Default for Terms {
     /// 30 s (three heartbeats of 10 s), and five losses: a job that kills its worker five times is poison. No quotas.
     fn default() -> Self {
-        Self { lease: Duration::from_secs(30), max_losses: 5, queue: 0, quotas: Arc::default() }
+        Self { lease: Duration::from_secs(30), max_losses: 5, queue: 0, quotas: Arc::default(), request_bytes: 1 << 20 }
     }
 }
 
@@ -82,8 +84,6 @@ pub enum Submitted {
     Replayed(Job),
     /// The key was used before for another request.
     KeyConflict,
-    /// A submit with this key is not finished yet.
-    InFlight,
     /// It was not accepted: as many jobs wait as may, over all tenants.
     QueueFull,
     /// It was not accepted: its tenant has what it may have.
@@ -299,7 +299,7 @@ pub trait Engine: Send + Sync {
     fn changes(&self, tenant: &Tenant, id: JobId) -> Changes;
     /// How much there is to do, as this node sees it.
     async fn depth(&self) -> Result<Depth, EngineError>;
-    /// Takes up to `limit` ends of jobs that somebody is to be told, the one that waits longest first. Each is whose took it for
+    /// Takes up to `limit` ends of jobs that somebody is to be told, of the tenants in turn and of each the one that waits longest first. Each is whose took it for
     /// the time of `hold`, and then due again unless it was settled. It became due in the same step in which its job ended.
     async fn take_notices(&self, limit: usize, hold: Duration) -> Result<Vec<DueNotice>, EngineError>;
     /// Notes what became of an attempt: the end is told again at `next`, or not any more. Nothing is noted of an attempt that was

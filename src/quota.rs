@@ -1,8 +1,8 @@
 //! How much of the service one tenant may have, so that it is there for the others.
 //!
 //! What a tenant has at once (jobs that wait, jobs that run) and what its jobs cost within an hour (vertices asked for, seconds
-//! computed) is judged by the [engine](crate::engine), which knows the jobs of every node. How often a tenant asks and how many bytes
-//! it uploads is judged where the requests arrive, by each node for itself.
+//! computed) is judged by the [engine](crate::engine), which knows the jobs of every node. How often a tenant asks, how many bytes
+//! it uploads and how many streams it has open is judged where the requests arrive, by each node for itself.
 
 use crate::tenant::Tenant;
 use serde::{Deserialize, Serialize};
@@ -30,6 +30,8 @@ pub struct Quota {
     pub upload_bytes_per_hour: u64,
     /// Requests to a node within a minute.
     pub requests_per_minute: u64,
+    /// Streams of events, long polls and downloads over gRPC that are open at a node.
+    pub streams: u64,
 }
 
 /// What a tenant may have that is not what every tenant may.
@@ -48,6 +50,8 @@ pub struct Exception {
     pub upload_bytes_per_hour: Option<u64>,
     /// As [`Quota::requests_per_minute`].
     pub requests_per_minute: Option<u64>,
+    /// As [`Quota::streams`].
+    pub streams: Option<u64>,
 }
 
 /// What every tenant may have.
@@ -71,6 +75,7 @@ impl Quotas {
             seconds_per_hour: own.seconds_per_hour.unwrap_or(every.seconds_per_hour),
             upload_bytes_per_hour: own.upload_bytes_per_hour.unwrap_or(every.upload_bytes_per_hour),
             requests_per_minute: own.requests_per_minute.unwrap_or(every.requests_per_minute),
+            streams: own.streams.unwrap_or(every.streams),
         }
     }
 }

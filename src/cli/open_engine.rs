@@ -22,6 +22,7 @@ pub async fn open_engine(config: &Config) -> Result<Arc<dyn Engine>, Box<dyn std
         max_losses: config.worker.max_losses,
         queue: config.limits.queued_jobs,
         quotas: Arc::new(config.quotas.clone()),
+        request_bytes: config.limits.body_bytes,
     };
     if config.engine == SQLITE {
         return Ok(Arc::new(Observed(Arc::new(SqliteEngine::open(&config.data_dir, terms)?))));

@@ -6,7 +6,7 @@ use crate::auth::Authenticator;
 use crate::auth::issuer::Issuer;
 use crate::auth::keys::KeyRing;
 use crate::blobs::Blobs;
-use crate::config::{AuthMode, Config, FOLDER, Role, SQLITE};
+use crate::config::{AuthMode, Config, FOLDER, Role};
 use crate::grpc;
 use crate::http::rates::Rates;
 use crate::http::{self, App};
@@ -26,7 +26,7 @@ use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
-/// Time from the signal to the end of the process at most; what has not ended by then is taken up after the next start.
+/// Time from the closing of the listeners to the end of the process at most; what has not ended by then is taken up after the next start.
 const DRAIN: Duration = Duration::from_secs(4);
 
 /// What the command line says; absent members leave the configuration as it is.
@@ -88,14 +88,6 @@ pub fn run(args: &ServeArgs) -> ExitCode {
 /// Opens the blob store, and warns of what will not work with it.
 async fn open_blobs(config: &Config) -> Result<Blobs, Box<dyn std::error::Error>> {
     if config.blobs == FOLDER {
-        if config.engine != SQLITE {
-            tracing::warn!(
-                "blobs are in this node's folder: other nodes of the cluster do not see them unless they share it"
-            );
-        }
-        if config.download_link_s > 0 {
-            tracing::warn!("download_link_s does nothing: blobs in a folder have no links");
-        }
         return Ok(Blobs::in_folder(&config.data_dir.join("blobs"))?);
     }
     let blobs = Blobs::in_bucket(&config.blobs)?;
@@ -126,6 +118,9 @@ async fn open_authenticator(
 }
 
 async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std::error::Error>> {
+    for warning in config.warnings() {
+        tracing::warn!("{warning}");
+    }
     let exposition = Exposition::start()?;
     let engine = open_engine(&config).await?;
     let blobs = open_blobs(&config).await?;
@@ -134,15 +129,12 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
         .thread_name(|i| format!("pool-{i}"))
         .start_handler(|_| priority::give_way())
         .build()?;
-    let stop = CancellationToken::new();
+    let (stop, close) = (CancellationToken::new(), CancellationToken::new());
     let authenticator = open_authenticator(&config, &stop).await?;
     let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
 
     let listener = TcpListener::bind(config.listen).await?;
     let address = listener.local_addr()?;
-    if !address.ip().is_loopback() && config.auth.mode == AuthMode::None && config.role != Role::Worker {
-        tracing::warn!("listening beyond loopback without authentication: whoever reaches this address can use it");
-    }
     if config.role != Role::Api {
         metrics::worker_started(config.worker.slots, pool.current_num_threads());
     }
@@ -176,12 +168,13 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
         metrics_apart: config.metrics_listen.is_some(),
         webhooks: Arc::new(config.webhooks.clone()),
         rates: Arc::new(Rates::new(config.quotas.clone())),
+        upload_room: http::body::Room::new(config.limits.upload_bytes),
         stop: stop.clone(),
     };
     if let Some(address) = config.metrics_listen {
         let (listener, router) = (TcpListener::bind(address).await?, http::metrics::router(app.clone()));
         tracing::info!(http.address = %listener.local_addr()?, "serving metrics");
-        tokio::spawn(http::server::serve(listener, router, stop.clone()));
+        tokio::spawn(http::server::serve(listener, router, close.clone()));
     }
     let router = match config.role {
         Role::Worker => http::health_router(app.clone(), grpc::health_routes(app)),
@@ -189,18 +182,30 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
     };
     let router = router.layer(axum::middleware::from_fn(grpc::speak));
     let routes = router.clone();
-    let server = tokio::spawn(http::server::serve(listener, router, stop.clone()));
+    let server = tokio::spawn(http::server::serve(listener, router, close.clone()));
     // the program that started this one may wait for this line
     tracing::info!(http.address = %address, data.dir = %config.data_dir.display(), "listening");
     if let Some(field) = first {
         tokio::spawn(first_job::run(routes, address, field));
     }
 
-    tokio::select! {
-        _ = terminate.recv() => tracing::info!(signal = "SIGTERM", "stopping"),
-        _ = interrupt.recv() => tracing::info!(signal = "SIGINT", "stopping"),
-    }
+    let drain = tokio::select! {
+        _ = terminate.recv() => {
+            tracing::info!(signal = "SIGTERM", "stopping");
+            Duration::from_secs(config.drain_s)
+        }
+        // a person does not wait for a balancer
+        _ = interrupt.recv() => {
+            tracing::info!(signal = "SIGINT", "stopping");
+            Duration::ZERO
+        }
+    };
     stop.cancel();
+    tokio::select! {
+        () = tokio::time::sleep(drain) => {}
+        _ = interrupt.recv() => {}
+    }
+    close.cancel();
     let drained = async {
         if let Some(worker) = worker {
             worker.await?;

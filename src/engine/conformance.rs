@@ -38,7 +38,7 @@ pub fn terms() -> Terms {
         (tenant("seconds"), Exception { seconds_per_hour: Some(1), ..none }),
     ];
     let quotas = Quotas { tenants: bounded.into(), ..Quotas::default() };
-    Terms { lease: LEASE, max_losses: 2, queue: QUEUE, quotas: Arc::new(quotas) }
+    Terms { lease: LEASE, max_losses: 2, queue: QUEUE, quotas: Arc::new(quotas), ..Terms::default() }
 }
 
 fn tenant(name: &str) -> Tenant {
@@ -187,7 +187,6 @@ async fn a_key_makes_a_submit_repeatable(engine: &Arc<dyn Engine>) {
                 answers.push(job);
             }
             Submitted::Replayed(job) => answers.push(job),
-            Submitted::InFlight => {}
             other => panic!("the same request is answered with its job, not with {other:?}"),
         }
     }
@@ -375,6 +374,30 @@ async fn an_end_is_told_until_that_is_settled(engine: &Arc<dyn Engine>) {
     engine.settle_notice(&own(), canceled, 1, Some(Timestamp::now())).await.expect("settles");
     engine.forget(&own(), canceled).await.expect("forgets");
     assert!(none().await, "nobody is told of a job that was forgotten");
+
+    // who has many ends to tell does not hold up who has one
+    let mut ids = Vec::new();
+    for name in ["many", "many", "many", "one"] {
+        let id = submit(engine, NewJob { tenant: tenant(name), ..told() }).await;
+        engine.request_cancel(&tenant(name), id).await.expect("cancels");
+        ids.push((tenant(name), id));
+    }
+    for (tenant, id) in &ids {
+        let canceled =
+            async || engine.list(tenant, ListQuery { limit: 8, ..ListQuery::default() }).await.expect("lists");
+        let deadline = tokio::time::Instant::now() + PATIENCE;
+        while !canceled().await.jobs.iter().any(|job| job.id == *id && job.state == State::Canceled) {
+            assert!(tokio::time::Instant::now() < deadline, "the list is late");
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    }
+    let taken = engine.take_notices(2, LONG).await.expect("takes");
+    let whose: Vec<&str> = taken.iter().map(|notice| notice.tenant.name()).collect();
+    assert_eq!(whose, ["many", "one"]);
+    engine.take_notices(8, LONG).await.expect("takes");
+    for (tenant, id) in &ids {
+        engine.settle_notice(tenant, *id, 1, None).await.expect("settles");
+    }
 }
 
 async fn collect(engine: &Arc<dyn Engine>, id: JobId, after: Option<u64>) -> Vec<Event> {

@@ -85,14 +85,7 @@ impl NatsEngine {
     /// # Errors
     /// When no server answers, it has no JetStream, or the folder cannot be written.
     pub async fn open(address: &Address, folder: &Path, terms: Terms) -> Result<Self, EngineError> {
-        if terms.lease < link::CALL {
-            tracing::warn!(
-                lease_s = terms.lease.as_secs_f64(),
-                call_s = link::CALL.as_secs(),
-                "leases are shorter than an interruption of the servers may be: jobs will be run again without need"
-            );
-        }
-        let link = Link::open(address).await?;
+        let link = Link::open(address, terms.request_bytes).await?;
         let layout = patiently(Layout::open(&link, address)).await?;
         let ledger = Arc::new(Ledger { link, layout, projection: Projection::open(folder)? });
         let feed = Feed::start(ledger.clone()).await?;

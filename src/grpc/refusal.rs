@@ -42,8 +42,6 @@ pub fn status(problem: &Problem, request_id: &str) -> Status {
 fn code(problem: &Problem) -> Code {
     match (problem.code(), problem.status()) {
         ("unknown_route" | "not_found", _) => Code::Unimplemented,
-        // worth repeating as it is
-        ("idempotency_key_in_flight", _) => Code::Aborted,
         (_, StatusCode::BAD_REQUEST | StatusCode::UNPROCESSABLE_ENTITY) => Code::InvalidArgument,
         (_, StatusCode::UNAUTHORIZED) => Code::Unauthenticated,
         (_, StatusCode::FORBIDDEN) => Code::PermissionDenied,

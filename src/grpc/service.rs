@@ -133,11 +133,16 @@ impl Shrinkd for Service {
         let asked = Asked::of(&request);
         let follow = async {
             let tenant = asked.may(Scope::Read)?;
+            let open = self.app.rates.open_stream(&tenant)?;
             let proto::WatchRequest { id, after } = request.into_inner();
             let id = jobs::job_id(&id)?;
             let events = engine::follow(self.app.engine.clone(), &tenant, id, after).await?;
             let events = events.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
-            Ok(events.map(|event| Ok(message::event(event?.as_ref()))).boxed())
+            let told = events.map(move |event| {
+                let _here = &open;
+                Ok(message::event(event?.as_ref()))
+            });
+            Ok(told.boxed())
         };
         let events = follow.await.map_err(|problem| asked.refuse(problem))?;
         Ok(Response::new(bounded(events, asked, self.app.stop.clone())))
@@ -147,6 +152,7 @@ impl Shrinkd for Service {
         let asked = Asked::of(&request);
         let download = async {
             let tenant = asked.may(Scope::Read)?;
+            let open = self.app.rates.open_stream(&tenant)?;
             let proto::DownloadRequest { id, name, offset } = request.into_inner();
             let made = outputs::find(&self.app, &tenant, &id, &name).await?;
             let bytes = made.output.bytes;
@@ -161,7 +167,12 @@ impl Shrinkd for Service {
             let source = outputs::read(&self.app, made.blob, Some(offset..bytes)).await?;
             let source = source.map(|piece| piece.map_err(Problem::from)).boxed();
             let hash = (offset == 0).then(|| (Sha256::new(), *made.blob.bytes()));
-            Ok(pieces(Source { source, buffer: BytesMut::new(), left: bytes - offset, hash }))
+            let told = pieces(Source { source, buffer: BytesMut::new(), left: bytes - offset, hash });
+            let told = told.map(move |piece| {
+                let _here = &open;
+                piece
+            });
+            Ok(told.boxed())
         };
         let pieces = download.await.map_err(|problem| asked.refuse(problem))?;
         let chunks = pieces.map(|piece| piece.map(|data| proto::Chunk { data })).boxed();
@@ -174,16 +185,17 @@ impl Shrinkd for Service {
         let (mut chunks, limit) = (request.into_inner(), self.app.limits.input_bytes);
         let refuse = |problem| asked.refuse(problem);
         let read = async {
-            let mut bytes = BytesMut::new();
+            let (mut bytes, mut room) = (BytesMut::new(), self.app.upload_room.taken());
             while let Some(chunk) = body::within(body::STALL, chunks.message()).await.map_err(refuse)?? {
                 if (bytes.len() + chunk.data.len()) as u64 > limit {
                     return Err(refuse(Problem::too_large(limit)));
                 }
+                room.more(chunk.data.len() as u64).map_err(refuse)?;
                 bytes.extend_from_slice(&chunk.data);
             }
-            Ok(bytes.freeze())
+            Ok((bytes.freeze(), room))
         };
-        let bytes = body::within(body::WHOLE, read).await.map_err(refuse)??;
+        let (bytes, _room) = body::within(body::WHOLE, read).await.map_err(refuse)??;
         let stored = inputs::store(&self.app, &tenant, bytes, FieldOptions::default()).await;
         let (Stored::Known(input) | Stored::New(input)) = stored.map_err(|problem| asked.refuse(problem))?;
         Ok(Response::new(proto::UploadResponse {

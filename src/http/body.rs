@@ -6,6 +6,8 @@ use axum::http::{HeaderMap, StatusCode, header};
 use bytes::{Bytes, BytesMut};
 use futures::StreamExt;
 use serde_json::Value;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 /// Bytes that are still read, and thrown away, from a body that is too large: a client that is not listening yet would
@@ -17,12 +19,65 @@ pub const STALL: Duration = Duration::from_secs(30);
 /// Longest time for a whole body: the largest input over a line of three megabits a second.
 pub const WHOLE: Duration = Duration::from_secs(15 * 60);
 
+/// Room for the bodies of uploads that are read at the same time. It is taken as bytes come, so that whoever sends none takes none.
+#[derive(Clone)]
+pub struct Room(Arc<AtomicU64>);
+
+/// What an upload has taken of the room, until this is dropped.
+pub struct Taken {
+    room: Room,
+    bytes: u64,
+}
+
+impl Room {
+    /// So many bytes.
+    pub fn new(bytes: u64) -> Self {
+        Self(Arc::new(AtomicU64::new(bytes)))
+    }
+
+    /// Nothing yet.
+    pub fn taken(&self) -> Taken {
+        Taken { room: self.clone(), bytes: 0 }
+    }
+}
+
+impl Taken {
+    /// Takes so many bytes more.
+    ///
+    /// # Errors
+    /// 503 when there are not so many.
+    pub fn more(&mut self, bytes: u64) -> Result<(), Problem> {
+        let taken = self.room.0.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |left| left.checked_sub(bytes));
+        taken.map_err(|_| {
+            Problem::unavailable("uploads_full", "as many bytes are being uploaded as may at the same time")
+        })?;
+        self.bytes += bytes;
+        Ok(())
+    }
+}
+
+impl Drop for Taken {
+    fn drop(&mut self) {
+        self.room.0.fetch_add(self.bytes, Ordering::Relaxed);
+    }
+}
+
 /// Reads a body of at most `limit` bytes.
 ///
 /// # Errors
 /// 413 when it is larger, 400 when it breaks off, 408 when it does not go on.
 pub async fn read(body: Body, limit: u64) -> Result<Bytes, Problem> {
-    within(WHOLE, read_all(body, limit)).await?
+    within(WHOLE, read_all(body, limit, |_| Ok(()))).await?
+}
+
+/// As [`read`], with the room that the body takes.
+///
+/// # Errors
+/// Those of [`read`], and 503 when there is no room for it beside the others.
+pub async fn read_upload(body: Body, limit: u64, room: &Room) -> Result<(Bytes, Taken), Problem> {
+    let mut taken = room.taken();
+    let bytes = within(WHOLE, read_all(body, limit, |bytes| taken.more(bytes))).await??;
+    Ok((bytes, taken))
 }
 
 /// What comes in time.
@@ -37,7 +92,7 @@ pub(crate) async fn within<T>(time: Duration, work: impl Future<Output = T>) -> 
     })
 }
 
-async fn read_all(body: Body, limit: u64) -> Result<Bytes, Problem> {
+async fn read_all(body: Body, limit: u64, mut hold: impl FnMut(u64) -> Result<(), Problem>) -> Result<Bytes, Problem> {
     let mut stream = body.into_data_stream();
     let (mut bytes, mut discarded) = (BytesMut::new(), 0u64);
     while let Some(chunk) = within(STALL, stream.next()).await? {
@@ -53,6 +108,7 @@ async fn read_all(body: Body, limit: u64) -> Result<Bytes, Problem> {
                 break;
             }
         } else {
+            hold(length)?;
             bytes.extend_from_slice(&chunk);
         }
     }
@@ -92,6 +148,19 @@ pub fn parse_json(bytes: &[u8]) -> Result<Value, Problem> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[tokio::test]
+    async fn uploads_have_room_together_and_give_it_back() {
+        let room = Room::new(10);
+        let upload = |bytes: &'static str| read_upload(Body::from(bytes), 100, &room);
+        let (first, held) = upload("123456").await.expect("there is room");
+        assert_eq!(first, "123456");
+        let refused = upload("12345").await.err().expect("there is no room beside it");
+        assert_eq!((refused.code(), refused.status()), ("uploads_full", StatusCode::SERVICE_UNAVAILABLE));
+        assert!(upload("1234").await.is_ok(), "what was refused holds nothing");
+        drop(held);
+        assert!(upload("1234567890").await.is_ok());
+    }
 
     #[tokio::test(start_paused = true)]
     async fn a_body_that_does_not_go_on_is_not_waited_for() {

@@ -93,6 +93,7 @@ async fn page(app: &App, tenant: &Tenant, id: JobId, after: u64, limit: usize) -
 }
 
 async fn stream(app: App, tenant: &Tenant, id: JobId, after: Option<u64>) -> Result<Response, Problem> {
+    let open = app.rates.open_stream(tenant)?;
     let unknown = || Problem::unknown_job(&id.to_string());
     if let Some(after) = after {
         let seen = app.engine.events_after(tenant, id, after, 1).await?.ok_or_else(unknown)?;
@@ -103,7 +104,7 @@ async fn stream(app: App, tenant: &Tenant, id: JobId, after: Option<u64>) -> Res
     let events = engine::follow(app.engine, tenant, id, after).await?.ok_or_else(unknown)?;
     let client = Present::sse_client();
     let frames = events.enumerate().map(move |(i, event)| {
-        let _here = &client;
+        let _here = (&client, &open);
         let event = event.inspect_err(|error| tracing::error!(job.id = %id, %error, "a stream broke off"))?;
         metrics::event_sent(event.kind.name());
         let frame =

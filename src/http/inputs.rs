@@ -100,7 +100,7 @@ fn says_nothing(options: &FieldOptions) -> bool {
         (status = 400, description = "a query parameter is unknown or does not fit the file, or the body broke off"),
         (status = 413, description = "the file is too large"),
         (status = 422, description = "the file cannot be read as a field"),
-        (status = 503, description = "the service is stopping"),
+        (status = 503, description = "the service is stopping, or as many bytes are being uploaded as may"),
     )
 )]
 pub async fn upload(
@@ -111,7 +111,7 @@ pub async fn upload(
 ) -> Result<Response, Problem> {
     let tenant = caller.may(Scope::Write)?;
     let options = reading_options(raw.as_deref())?;
-    let bytes = body::read(body, app.limits.input_bytes).await?;
+    let (bytes, _room) = body::read_upload(body, app.limits.input_bytes, &app.upload_room).await?;
     match store(&app, tenant, bytes, options).await? {
         Stored::Known(input) => Ok((StatusCode::OK, Json(input)).into_response()),
         Stored::New(input) => {

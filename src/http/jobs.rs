@@ -72,7 +72,6 @@ pub struct Estimate {
             ("Idempotent-Replayed", description = "`true` when this is the answer to an earlier request with the same key"))),
         (status = 200, description = "ended in time, or (with validate_only) the estimate", body = SubmitAnswer),
         (status = 400, description = "the body is not JSON, or a header or parameter is malformed"),
-        (status = 409, description = "a request with this key is not finished yet"),
         (status = 413, description = "the body is too large"),
         (status = 415, description = "the body is not application/json"),
         (status = 422, description = "the request is wrong, or its key was used for another request"),
@@ -226,10 +225,6 @@ fn accepted(submitted: Submitted) -> Result<Accepted, Problem> {
                 "the key was used for another request",
                 detail,
             ));
-        }
-        Submitted::InFlight => {
-            let detail = "a request with the same key is being worked on";
-            return Err(Problem::conflict("idempotency_key_in_flight", "the key is in use", detail).retry_after(1));
         }
         Submitted::OverQuota(over) => return Err(Problem::over_quota(over)),
         Submitted::QueueFull => {
@@ -424,6 +419,7 @@ async fn wait_until(
     done: impl Fn(&Job) -> bool,
 ) -> Result<Option<Job>, Problem> {
     let deadline = tokio::time::Instant::now() + wait;
+    let _open = if wait.is_zero() { None } else { Some(app.rates.open_stream(tenant)?) };
     let mut changes = (!wait.is_zero()).then(|| app.engine.changes(tenant, id));
     loop {
         let Some(job) = app.engine.get(tenant, id).await? else { return Ok(None) };

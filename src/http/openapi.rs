@@ -56,6 +56,7 @@ pub(super) fn complete(mut document: OpenApi) -> OpenApi {
         for operation in operations.into_iter().flatten() {
             if !super::caller::OPEN.contains(&path.as_str()) {
                 describe_caller(operation);
+                describe_outages(operation);
             }
             describe_problems(operation);
             operation.parameters.iter_mut().flatten().for_each(never_null);
@@ -86,6 +87,20 @@ fn describe_caller(operation: &mut Operation) {
         ("429", "a quota of the tenant is used up: `RateLimit` tells which, where there are quotas"),
     ] {
         operation.responses.responses.entry(status.to_owned()).or_insert_with(|| RefOr::T(Response::new(description)));
+    }
+}
+
+/// What is needed for an answer may be out of reach, and a body may not come.
+fn describe_outages(operation: &mut Operation) {
+    let mut with = |status: &str, description: &str| {
+        operation.responses.responses.entry(status.to_owned()).or_insert_with(|| RefOr::T(Response::new(description)));
+    };
+    with(
+        "503",
+        "the queue, the blob store or the issuer of tokens is out of reach, or the service is stopping: `Retry-After` tells when to ask again",
+    );
+    if operation.request_body.is_some() {
+        with("408", "the body does not come");
     }
 }
 

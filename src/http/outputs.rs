@@ -83,7 +83,9 @@ pub async fn download(
     set(header::CONTENT_DISPOSITION, &format!("inline; filename=\"{id}.{}\"", kind.extension()))?;
     // a browser must not guess that an output is a page
     set(header::X_CONTENT_TYPE_OPTIONS, "nosniff")?;
+    // a link is signed for GET
     if !app.download_link.is_zero()
+        && method == Method::GET
         && let Some(link) = app.blobs.signed_link(blob, app.download_link).await?
     {
         // the link dies before its answer may be reused

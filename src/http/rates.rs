@@ -9,13 +9,17 @@ use crate::quota::{Exceeded, HOUR, MINUTE, Quotas};
 use crate::tenant::Tenant;
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode};
 use std::collections::HashMap;
-use std::sync::Mutex;
+use std::collections::hash_map::Entry;
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 const RATE_LIMIT: HeaderName = HeaderName::from_static("ratelimit");
 const RATE_LIMIT_POLICY: HeaderName = HeaderName::from_static("ratelimit-policy");
 /// Buckets that are looked through for full ones, which say nothing.
 const MANY: usize = 1024;
+
+/// When to ask for a stream again that was one too many: nobody knows when another one ends.
+const STREAM_PAUSE: Duration = Duration::from_secs(5);
 
 /// What is counted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -37,11 +41,28 @@ pub struct Standing {
     more_after: Duration,
 }
 
-/// Everybody's buckets.
+/// Everybody's buckets, and how many streams everybody has open.
 #[derive(Default)]
 pub struct Rates {
     quotas: Quotas,
     buckets: Mutex<HashMap<(Tenant, Rate), Bucket>>,
+    streams: Mutex<HashMap<Tenant, u64>>,
+}
+
+/// A stream that is open, until this is dropped.
+pub struct OpenStream(Option<(Arc<Rates>, Tenant)>);
+
+impl Drop for OpenStream {
+    fn drop(&mut self) {
+        let Some((rates, tenant)) = self.0.take() else { return };
+        let mut streams = rates.streams.lock().unwrap_or_else(|e| e.into_inner());
+        if let Entry::Occupied(mut open) = streams.entry(tenant) {
+            *open.get_mut() -= 1;
+            if *open.get() == 0 {
+                open.remove();
+            }
+        }
+    }
 }
 
 #[derive(Clone, Copy)]
@@ -53,7 +74,26 @@ struct Bucket {
 impl Rates {
     /// Full buckets.
     pub fn new(quotas: Quotas) -> Self {
-        Self { quotas, buckets: Mutex::default() }
+        Self { quotas, ..Self::default() }
+    }
+
+    /// Lets a tenant open a stream, where it may have another one.
+    ///
+    /// # Errors
+    /// When it has as many as it may.
+    pub fn open_stream(self: &Arc<Self>, tenant: &Tenant) -> Result<OpenStream, Problem> {
+        let limit = self.quotas.of(tenant).streams;
+        if limit == 0 {
+            return Ok(OpenStream(None));
+        }
+        let mut streams = self.streams.lock().unwrap_or_else(|e| e.into_inner());
+        let open = streams.entry(tenant.clone()).or_default();
+        if *open >= limit {
+            let over = Exceeded { quota: "streams", limit, window: None, left: 0, retry_after: STREAM_PAUSE };
+            return Err(Problem::over_quota(over));
+        }
+        *open += 1;
+        Ok(OpenStream(Some((self.clone(), tenant.clone()))))
     }
 
     /// Takes so much of a tenant's quota; what is left, where there is a limit.
@@ -126,6 +166,7 @@ impl Problem {
         let Exceeded { quota, limit, window, left, retry_after: more_after } = over;
         let detail = match (quota, left) {
             ("queued", _) => format!("{limit} jobs of yours wait, and no more may (quota {quota})"),
+            ("streams", _) => format!("{limit} streams of yours are open, and no more may be (quota {quota})"),
             (_, 0) => format!("nothing is left of your quota {quota} of {limit}"),
             _ => format!("{left} are left of your quota {quota} of {limit}, fewer than this takes"),
         };
@@ -160,6 +201,20 @@ mod tests {
         let let_through = (0..1000).filter(|_| take(3600.0).is_ok()).count();
         assert_eq!(let_through, 60, "a bucket holds no more than its quota");
         assert!(rates.take_at(&"other".parse().expect("a name"), Rate::Requests, 1, start).is_ok(), "each has its own");
+    }
+
+    #[test]
+    fn a_stream_that_ends_makes_room_for_another() {
+        let default = Quota { streams: 2, ..Quota::default() };
+        let rates = Arc::new(Rates::new(Quotas { default, ..Quotas::default() }));
+        let (tenant, other) = (Tenant::default(), "other".parse().expect("a name"));
+        let (first, _second) = (rates.open_stream(&tenant).expect("opens"), rates.open_stream(&tenant).expect("opens"));
+        let refused = rates.open_stream(&tenant).err().expect("is one too many");
+        assert_eq!((refused.code(), refused.retry_after_s()), ("quota_exceeded", Some(5)));
+        let _others = rates.open_stream(&other).expect("each has its own");
+        drop(first);
+        let _third = rates.open_stream(&tenant).expect("there is room again");
+        assert!(rates.open_stream(&tenant).is_err());
     }
 
     #[test]

@@ -19,15 +19,16 @@ const PING: Duration = Duration::from_secs(30);
 /// Pause after a connection could not be accepted, because files have run out.
 const PAUSE: Duration = Duration::from_millis(200);
 
-/// Serves until `stop` is raised, and then until every request that is under way has its answer.
-pub async fn serve(listener: TcpListener, router: Router, stop: CancellationToken) {
+/// Serves until `close` is raised, and then until every request that is under way has its answer. Whoever asks between the stop of the
+/// service and that moment hears that it is stopping.
+pub async fn serve(listener: TcpListener, router: Router, close: CancellationToken) {
     let mut builder = auto::Builder::new(TokioExecutor::new());
     builder.http1().timer(TokioTimer::new()).header_read_timeout(HEAD);
     builder.http2().timer(TokioTimer::new()).keep_alive_interval(PING).keep_alive_timeout(PING);
     let open = GracefulShutdown::new();
     loop {
         let accepted = tokio::select! {
-            () = stop.cancelled() => break,
+            () = close.cancelled() => break,
             accepted = listener.accept() => accepted,
         };
         let stream = match accepted {

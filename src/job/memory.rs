@@ -35,6 +35,11 @@ const SAMPLE: u64 = 32;
 /// What one output of a layer leaves behind for the way back, for one sample of a batch: of a value, and of a value with its gradient.
 const PASS: [u64; 2] = [16, 64];
 
+/// What every job is taken to need.
+pub const fn of_least_job() -> u64 {
+    EVERY
+}
+
 /// What an input takes once it is a field: of so many bytes, and described so.
 pub fn of_input(bytes: u64, description: &Description) -> u64 {
     match description {

@@ -19,7 +19,7 @@ use bytes::Bytes;
 use std::cell::Cell;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 use tokio::time::Interval;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -28,8 +28,10 @@ use tracing::field::Empty;
 
 /// Least time between two progress events of a job.
 const PROGRESS_EVERY: Duration = Duration::from_millis(100);
-/// Least time between two mesh events of a job.
+/// Mean time between two mesh events of a job, ...
 const MESH_EVERY: Duration = Duration::from_millis(250);
+/// ... of which so many may come at once: a contraction is over in a moment, and is what one wants to see.
+const MESH_BURST: u32 = 8;
 /// Least time between two checkpoints of a job.
 const CHECKPOINT_EVERY: Duration = Duration::from_secs(5);
 /// How long a worker that found nothing to do waits before it asks again; a new job wakes it at once.
@@ -38,6 +40,10 @@ const CLAIM_WAIT: Duration = Duration::from_secs(20);
 const BACKOFF: Duration = Duration::from_secs(1);
 /// How often a job that waits for memory looks whether it is still wanted.
 const ROOM_LOOK: Duration = Duration::from_millis(200);
+/// Pause before a job is given back whose inputs or outputs were out of reach; it grows with every attempt, ...
+const OUT_OF_REACH: Duration = Duration::from_secs(5);
+/// ... up to so many times that.
+const LONGEST_PAUSE: u32 = 12;
 /// How often the end of a job is tried to be written before it is left to the next attempt.
 const FINISH_TRIES: u32 = 5;
 /// Time that running jobs get to come to their end once the service stops.
@@ -147,14 +153,17 @@ impl Worker {
         let cancel = CancelToken::new();
         let (news, mut inbox) = mpsc::unbounded_channel();
         let work = self.work(claim.clone(), cancel.clone(), news);
-        // before anything is read; a job that waits for room can be canceled meanwhile, and its time runs
+        // before anything is read; a job that waits for room can be canceled meanwhile, and its time does not run yet
         let needed = claim.spec.memory_bytes.unwrap_or(0);
         let (memory, waiting) = (self.memory.clone(), cancel.clone());
+        let (begin, mut begun) = oneshot::channel();
         let work = async move {
             let _room = match &memory {
                 Some(memory) => Some(until_canceled(&waiting, memory.take(needed)).await?),
                 None => None,
             };
+            // nobody listens once the claim is lost
+            let _ = begin.send(());
             work.await
         };
         let mut work = tokio::spawn(work.in_current_span());
@@ -166,6 +175,7 @@ impl Worker {
         let allowed = Duration::from_secs(claim.spec.deadline_s.unwrap_or(self.job_seconds).into());
         let deadline = tokio::time::sleep(allowed);
         tokio::pin!(deadline);
+        let mut running = false;
         let result = loop {
             tokio::select! {
                 // what was told before the end is stored before the end
@@ -187,7 +197,11 @@ impl Worker {
                     returning = true;
                     cancel.cancel();
                 }
-                () = &mut deadline, if late.is_none() => {
+                Ok(()) = &mut begun, if !running => {
+                    running = true;
+                    deadline.as_mut().reset(tokio::time::Instant::now() + allowed);
+                }
+                () = &mut deadline, if running && late.is_none() => {
                     // what was to be stopped before has not failed
                     late = Some(!cancel.is_canceled());
                     cancel.cancel();
@@ -219,7 +233,18 @@ impl Worker {
             Err(Unfinished::OutOfReach) => None,
         };
         let Some(outcome) = outcome else {
-            tracing::warn!("the blob store is out of reach; the job is left to the next attempt");
+            drop(promise);
+            // an outage is no fault of the job's and counts as no loss; nobody knows when it ends
+            let pause = OUT_OF_REACH * claim.attempt.clamp(1, LONGEST_PAUSE);
+            tracing::warn!(
+                pause_s = pause.as_secs(),
+                "the blob store is out of reach; the job is given back after a pause"
+            );
+            let pause = async {
+                tokio::select! { () = tokio::time::sleep(pause) => {}, () = give_back.cancelled() => {} }
+            };
+            self.renewing(&claim, &mut heartbeat, pause).await;
+            self.end(&claim, Outcome::Released).await;
             return "unfinished";
         };
         let over = !matches!(outcome, Outcome::Released);
@@ -281,7 +306,7 @@ impl Worker {
                 let _entered = span.enter();
                 let teller = Teller::new(news);
                 let progress = |progress: Progress| teller.tell(progress);
-                let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress };
+                let settings = Settings { pool: &pool, cancel: &cancel, progress: &progress, watched: true };
                 match &spec.work {
                     Work::Shrink(work) => {
                         let mut inputs = inputs.iter();
@@ -453,6 +478,7 @@ struct Last {
     /// Attempt and stage.
     step: (u32, &'static str),
     progress: Option<Instant>,
+    /// When as many mesh events would have come as have, at their mean pace.
     mesh: Option<Instant>,
 }
 
@@ -474,10 +500,11 @@ impl Teller {
             // nobody listens any more once the claim is lost
             let _ = self.news.send(Update { kind: EventKind::Progress, data, progress: Some(view) });
         }
-        if due(last.mesh, MESH_EVERY)
+        let paced = last.mesh.map_or(now, |mesh| mesh.max(now)) + MESH_EVERY;
+        if paced <= now + MESH_BURST * MESH_EVERY
             && let Some(preview) = progress.front.as_ref().and_then(MeshPreview::new)
         {
-            last.mesh = Some(now);
+            last.mesh = Some(paced);
             let data = serde_json::to_value(preview).unwrap_or_default();
             let _ = self.news.send(Update { kind: EventKind::Mesh, data, progress: None });
         }
@@ -509,7 +536,7 @@ mod tests {
     fn news_are_told_at_a_pace_that_can_be_followed() {
         let (news, mut inbox) = mpsc::unbounded_channel();
         let teller = Teller::new(news);
-        let front = crate::settings::Front { positions: vec![[0.0; 3]; 3], triangles: vec![[0, 1, 2]] };
+        let front = crate::settings::Front { positions: vec![[0.0; 3]; 3], triangles: vec![[0, 1, 2]], places: vec![] };
         for iteration in 0..1000 {
             teller.tell(Progress { stage: "contract", iteration, front: Some(front.clone()), ..Progress::default() });
         }
@@ -520,7 +547,7 @@ mod tests {
             told[usize::from(update.kind == EventKind::Mesh)] += 1;
         }
         assert!(
-            told[0] <= 1 + elapsed.as_millis() as u32 / 100 && told[1] <= 1 + elapsed.as_millis() as u32 / 250,
+            told[0] <= 1 + elapsed.as_millis() as u32 / 100 && told[1] <= MESH_BURST + elapsed.as_millis() as u32 / 250,
             "{told:?}"
         );
         assert!(told[0] >= 1 && told[1] >= 1);

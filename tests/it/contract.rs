@@ -24,6 +24,11 @@ async fn every_operation_is_described_with_its_problems() {
         for (method, operation) in item.as_object().expect("operations") {
             assert!(operation["summary"].is_string(), "{method} {path} has no summary");
             assert!(names.insert(operation["operationId"].to_string()), "{method} {path} shares its name");
+            let open = ["/livez", "/readyz", "/openapi.json"].contains(&path.as_str());
+            let outages = [(!open, "503"), (operation["requestBody"].is_object(), "408")];
+            for (_, status) in outages.iter().filter(|(can_be, _)| *can_be) {
+                assert!(operation["responses"][status].is_object(), "{method} {path} does not tell of {status}");
+            }
             for (status, response) in operation["responses"].as_object().expect("responses") {
                 if status.starts_with(['4', '5']) {
                     let problem = &response["content"]["application/problem+json"]["schema"]["$ref"];

@@ -90,8 +90,31 @@ async fn jobs_are_listed_newest_first_page_by_page() {
     let from = third["created_at"].as_str().expect("a time");
     assert!(names(&app.get_json(&format!("/v1/jobs?created_from={from}")).await).contains(&ids[2]));
     assert!(!names(&app.get_json(&format!("/v1/jobs?created_to={from}")).await).contains(&ids[2]));
-    let page = app.get("/").await.text().await.expect("text");
+    let page = app.get("/plain").await.text().await.expect("text");
     assert!(ids.iter().all(|id| page.contains(id.as_str())), "the page shows them all");
+}
+
+#[tokio::test]
+async fn a_node_that_drains_says_so_to_whoever_asks_and_then_ends() {
+    let folder = tempfile::tempdir().expect("folder");
+    let mut app = App::start_with(folder.path(), &[("SHRINKD_DRAIN_S", "300")]);
+    assert!(app.get("/readyz").await.status().is_success());
+    app.terminate();
+    let clock = std::time::Instant::now();
+    while app.get("/readyz").await.status().is_success() {
+        assert!(clock.elapsed() < crate::app::PATIENCE, "it is still ready\n{}", app.log());
+    }
+    // over a connection of its own: the port is still open
+    let client = reqwest::Client::new();
+    problem(client.get(format!("{}/readyz", app.url)).send().await.expect("an answer"), 503, "stopping").await;
+    let submit = client.post(format!("{}/v1/jobs", app.url)).json(&small()).send().await.expect("an answer");
+    assert!(submit.headers().contains_key("retry-after"));
+    problem(submit, 503, "stopping").await;
+    assert_eq!(app.get_json("/v1/jobs").await["jobs"], json!([]));
+    // who interrupts it does not want to wait
+    app.interrupt();
+    let (status, _) = app.wait();
+    assert!(status.success(), "{status}");
 }
 
 #[tokio::test]

@@ -6,6 +6,7 @@ mod bucket;
 mod certify;
 mod cli;
 mod cluster;
+mod cluster_backup;
 mod conditional;
 mod contract;
 mod control;

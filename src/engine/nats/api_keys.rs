@@ -29,7 +29,7 @@ impl NatsKeys {
     /// # Errors
     /// When no server answers, or it has no JetStream.
     pub async fn open(address: &Address) -> Result<Self, EngineError> {
-        let (link, prefix) = (Link::open(address).await?, address.prefix.clone());
+        let (link, prefix) = (Link::open(address, 0).await?, address.prefix.clone());
         let wanted = Config {
             name: format!("{prefix}_APIKEYS"),
             subjects: vec![format!("{prefix}.apikey.*")],

@@ -2,7 +2,7 @@
 //!
 //! The key's message is stored first and only if there is none; it names the job. Whoever finds it makes that very job, if it
 //! is not made yet, and of those who try one succeeds. So a submit that died in the middle is finished by its repetition, and
-//! nobody has to wait, to guess whether the other one is dead, or to free a key. [`Submitted::InFlight`] is never answered.
+//! nobody has to wait, to guess whether the other one is dead, or to free a key.
 
 use super::layout::Name;
 use super::ledger::{Found, Ledger};

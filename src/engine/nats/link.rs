@@ -35,9 +35,8 @@ const RECONNECT: Duration = Duration::from_millis(500);
 /// Servers before this version sync to disk by their own clock whatever they are told, so that what was accepted may be lost
 /// with the power.
 const OLDEST_SERVER: (i64, i64, i64) = (2, 10, 0);
-/// Servers that take no larger messages refuse some requests of the size that this service accepts by default (1 MiB, and
-/// more once defaults are spelled out).
-const LEAST_PAYLOAD: usize = 4 << 20;
+/// A request may take so many times its bytes once defaults are spelled out and it is written for the cluster.
+const SPELLED_OUT: usize = 4;
 
 /// The connection to the servers.
 #[derive(Clone)]
@@ -94,7 +93,7 @@ impl Link {
     ///
     /// # Errors
     /// When no server is reached, or it has no JetStream.
-    pub(super) async fn open(address: &Address) -> Result<Self, EngineError> {
+    pub(super) async fn open(address: &Address, request_bytes: u64) -> Result<Self, EngineError> {
         let (connected, connections) = watch::channel(0u64);
         let mut options = ConnectOptions::new();
         if let Some(file) = &address.credentials {
@@ -138,10 +137,11 @@ impl Link {
                 "this server is too old for `sync_interval: always`: a power cut may lose accepted jobs"
             );
         }
-        if info.max_payload < LEAST_PAYLOAD {
+        let advised = usize::try_from(request_bytes).unwrap_or(usize::MAX).saturating_mul(SPELLED_OUT);
+        if info.max_payload < advised {
             warn!(
                 nats.max_payload_bytes = info.max_payload,
-                nats.advised_bytes = LEAST_PAYLOAD,
+                nats.advised_bytes = advised,
                 "large requests will fail: raise max_payload of the server"
             );
         }

@@ -15,13 +15,15 @@ pub(super) fn owe(ctx: &Ctx<'_>, id: JobId) -> rusqlite::Result<()> {
     ctx.connection.prepare_cached(text)?.execute(params![id.to_string(), ctx.now]).map(|_| ())
 }
 
-/// The jobs, and whose they are, whose ends are due, the one that waits longest first.
+/// The jobs, and whose they are, whose ends are due: the tenants in turn, and of each the one that waits longest first, so that one
+/// tenant's silent receivers do not hold up another's notice.
 pub(in crate::engine) fn due(
     connection: &Connection,
     now: i64,
     limit: usize,
 ) -> rusqlite::Result<Vec<(Tenant, JobId)>> {
-    let text = "SELECT tenant, job FROM notices JOIN jobs ON id = job WHERE due_at <= ?1 ORDER BY due_at LIMIT ?2";
+    let text = "SELECT tenant, job FROM notices JOIN jobs ON id = job WHERE due_at <= ?1
+                ORDER BY ROW_NUMBER() OVER (PARTITION BY tenant ORDER BY due_at), due_at LIMIT ?2";
     let mut statement = connection.prepare_cached(text)?;
     let row = |row: &rusqlite::Row<'_>| Ok((row.get::<_, String>(0)?, row.get::<_, String>(1)?));
     let names = statement.query_map(params![now, limit as i64], row)?;

@@ -62,7 +62,7 @@ pub async fn differentiate(
     query::parameters(raw.as_deref(), &[], &[])?;
     let key = idempotency_key(&headers)?;
     let id = job_id(&id)?;
-    let bytes = body::read(body, app.limits.input_bytes).await?;
+    let (bytes, _room) = body::read_upload(body, app.limits.input_bytes, &app.upload_room).await?;
     app.rates.take(tenant, Rate::UploadedBytes, bytes.len() as u64)?;
     let checked = bytes.clone();
     let checked = tokio::task::spawn_blocking(move || check_gradient(&checked).map(|()| BlobId::of(&checked)));
