@@ -25,8 +25,10 @@ mod relaxed;
 #[path = "../support/bucket.rs"]
 mod s3;
 mod sensitivity;
+mod starts;
 mod tenants;
 mod traces;
+mod waiting;
 mod walk;
 mod warm;
 mod webhooks;
