@@ -6,6 +6,7 @@ mod bucket;
 mod certify;
 mod cli;
 mod cluster;
+mod collecting;
 mod conditional;
 mod contract;
 mod control;
