@@ -50,11 +50,14 @@ fn page(out: &Path) -> Done {
     let mut list = String::from("&[\n");
     for (i, path) in files.iter().enumerate() {
         let name = path.strip_prefix(&root)?.to_str().ok_or("a name that is not Unicode")?;
-        let packed = out.join(format!("page-{i}.gz"));
+        // copies, so that the page may be built anew while the program is compiled
+        let [plain, packed] = ["plain", "gz"].map(|kind| out.join(format!("page-{i}.{kind}")));
+        let bytes = std::fs::read(path)?;
         let mut encoder = GzEncoder::new(std::fs::File::create(&packed)?, Compression::best());
-        encoder.write_all(&std::fs::read(path)?)?;
+        encoder.write_all(&bytes)?;
         encoder.finish()?;
-        writeln!(list, "({name:?}, include_bytes!({path:?}), include_bytes!({packed:?})),")?;
+        std::fs::write(&plain, bytes)?;
+        writeln!(list, "({name:?}, include_bytes!({plain:?}), include_bytes!({packed:?})),")?;
     }
     list.push(']');
     Ok(std::fs::write(out.join("page.rs"), list)?)

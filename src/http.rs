@@ -109,8 +109,7 @@ pub fn health_router(app: App, others: axum::Router) -> axum::Router {
     let router = router.fallback(problem::unknown_route).method_not_allowed_fallback(problem::wrong_method);
     // it has nothing of any tenant
     let door = Door { authenticator: None, rates: Arc::default() };
-    let router = router.with_state(app).merge(others).layer(middleware::from_fn_with_state(door, caller::identify));
-    router.layer(middleware::from_fn(context::request))
+    wrapped(router.with_state(app).merge(others), door, &[])
 }
 
 /// The service, for those whom the authenticator knows, or for everybody where there is none. Browsers of other origins are let in only when `cors_origins` names them. `others` are routes that get the same around them.
@@ -122,12 +121,15 @@ pub fn router(
 ) -> axum::Router {
     let (router, _) = api().split_for_parts();
     let door = Door { authenticator, rates: app.rates.clone() };
+    let router = router.merge(web::routes());
+    let router = router.fallback(problem::unknown_route).method_not_allowed_fallback(problem::wrong_method);
+    wrapped(router.with_state(app).merge(others), door, cors_origins)
+}
+
+/// What every route has around it, from the inside out: an answer where a handler panics, who asks, what browsers are told about
+/// other origins, and the id, the line in the log and the problem document of [`context`].
+fn wrapped(router: axum::Router, door: Door, cors_origins: &[String]) -> axum::Router {
     let mut router = router
-        .merge(web::routes())
-        .fallback(problem::unknown_route)
-        .method_not_allowed_fallback(problem::wrong_method)
-        .with_state(app)
-        .merge(others)
         .layer(CatchPanicLayer::custom(problem::panicked))
         .layer(middleware::from_fn_with_state(door, caller::identify));
     if !cors_origins.is_empty() {
@@ -139,4 +141,41 @@ pub fn router(
         );
     }
     router.layer(middleware::from_fn(context::request))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use axum::body::Body;
+    use axum::http::{Request, StatusCode};
+    use axum::routing::get;
+    use tower::ServiceExt;
+
+    async fn panics() -> &'static str {
+        panic!("a secret of the inside")
+    }
+
+    #[tokio::test]
+    async fn a_handler_that_panics_is_answered_with_a_problem_that_names_the_request() {
+        let door = Door { authenticator: None, rates: Arc::default() };
+        let routes = axum::Router::new().route("/panics", get(panics)).route("/works", get(async || "works"));
+        let router = wrapped(routes, door, &["https://viewer.example".to_owned()]);
+        let ask = async |path: &str| {
+            let request =
+                Request::builder().uri(path).header("x-request-id", "r-1").header("origin", "https://viewer.example");
+            let request = request.body(Body::empty()).expect("a request");
+            router.clone().oneshot(request).await.expect("an answer")
+        };
+        let answer = ask("/panics").await;
+        assert_eq!(answer.status(), StatusCode::INTERNAL_SERVER_ERROR);
+        assert_eq!(answer.headers()["content-type"], "application/problem+json");
+        assert_eq!(answer.headers()["x-request-id"], "r-1");
+        assert_eq!(answer.headers()["access-control-allow-origin"], "https://viewer.example", "a page can read it");
+        let body = axum::body::to_bytes(answer.into_body(), 1 << 16).await.expect("a body");
+        let body: serde_json::Value = serde_json::from_slice(&body).expect("JSON");
+        assert_eq!((&body["code"], &body["status"]), (&"internal".into(), &500.into()));
+        assert_eq!(body["request_id"], "r-1");
+        assert!(!body.to_string().contains("secret"), "what was said inside stays there: {body}");
+        assert_eq!(ask("/works").await.status(), StatusCode::OK, "the others go on");
+    }
 }

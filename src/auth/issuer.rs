@@ -352,6 +352,9 @@ mod tests {
         let mut list = base.clone();
         list["scope"] = serde_json::json!(["shrinkd:read", "shrinkd:write", 7]);
         assert_eq!(issuer.caller(&list).expect("counts").may(Scope::Write).map(|t| t.name()), Ok("team"));
+        let bare = Issuer::new(&OidcConfig { scope_prefix: String::new(), ..config() }).expect("an issuer");
+        let caller = bare.caller(&base).expect("counts");
+        assert_eq!(caller, Caller::new("team".parse().expect("a name"), [Scope::Write]), "scopes may have no prefix");
         for (member, value) in [
             ("tenant", serde_json::json!("No Name")),
             ("tenant", Value::Null),

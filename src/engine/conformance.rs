@@ -28,6 +28,8 @@ pub const LEASE: Duration = Duration::from_millis(1500);
 const QUEUE: u64 = 60;
 /// Longer than any step of the suite may take.
 const PATIENCE: Duration = Duration::from_secs(20);
+/// More events than any engine keeps of a job.
+const MANY_EVENTS: u64 = 700;
 
 /// What an engine under test is opened with.
 pub fn terms() -> Terms {
@@ -77,6 +79,7 @@ pub async fn run(engine: Arc<dyn Engine>) {
     a_job_that_is_given_back_runs_again(&engine).await;
     a_job_that_is_lost_too_often_fails(&engine).await;
     a_reader_that_comes_back_misses_nothing(&engine).await;
+    a_reader_that_comes_too_late_goes_on_from_a_snapshot(&engine).await;
     a_waiting_worker_gets_a_job_as_it_comes(&engine).await;
     lists_are_newest_first_paged_and_filtered(&engine).await;
     only_an_ended_job_is_forgotten(&engine).await;
@@ -434,6 +437,48 @@ async fn a_reader_that_comes_back_misses_nothing(engine: &Arc<dyn Engine>) {
     let ahead = collect(engine, id, Some(9999)).await;
     assert_eq!(ahead[0].kind, EventKind::Snapshot, "a number that was never given out starts over");
     assert!(follow(engine.clone(), &own(), JobId::new(), None).await.expect("answers").is_none());
+}
+
+async fn a_reader_that_comes_too_late_goes_on_from_a_snapshot(engine: &Arc<dyn Engine>) {
+    const AT_ONCE: u64 = 50;
+    let id = submit(engine, new_job()).await;
+    let claim = claim_one(engine, "a").await;
+    let tell = async |events: u64| {
+        let news = (0..events).map(|i| progress(i as f32 / events as f32)).collect();
+        assert_eq!(engine.renew(&claim, news).await.expect("renews"), Renewal::Keep);
+    };
+    for _ in 0..MANY_EVENTS / AT_ONCE {
+        tell(AT_ONCE).await;
+    }
+    let page = engine.events_after(&own(), id, 1, 1).await.expect("reads").expect("is there");
+    let (oldest, newest) = (page.oldest, page.newest);
+    assert_eq!(newest, 2 + MANY_EVENTS, "queued, running, and the progress");
+    assert!(oldest > 2, "{oldest}: old events are let go");
+    let mut readers = Vec::new();
+    for after in [1, oldest - 2, oldest - 1] {
+        let events = follow(engine.clone(), &own(), id, Some(after)).await.expect("follows").expect("is there");
+        let mut events = events.map(|event| Event::clone(&event.expect("reads")));
+        let first = tokio::time::timeout(PATIENCE, events.next()).await.expect("in time").expect("an event");
+        if after < oldest - 1 {
+            assert_eq!((first.kind, first.seq), (EventKind::Snapshot, newest), "after {after}");
+            assert_eq!(first.data["state"], "running");
+        } else {
+            assert_eq!((first.kind, first.seq), (EventKind::Progress, oldest), "what is kept is told as it was");
+        }
+        readers.push((first.seq, events));
+    }
+    tell(3).await;
+    engine.finish(&claim, success("aa")).await.expect("finishes");
+    let done = newest + 5;
+    for (first, events) in readers {
+        let rest = tokio::time::timeout(PATIENCE, events.collect::<Vec<_>>()).await.expect("ends with the job");
+        let numbers: Vec<u64> = rest.iter().map(|event| event.seq).collect();
+        assert_eq!(numbers, (first + 1..=done).collect::<Vec<_>>(), "without a gap");
+        assert_eq!(rest.last().map(|event| event.kind), Some(EventKind::Done));
+    }
+    let after_the_end = collect(engine, id, Some(1)).await;
+    let told: Vec<_> = after_the_end.iter().map(|event| (event.kind, event.seq)).collect();
+    assert_eq!(told, [(EventKind::Snapshot, done - 1), (EventKind::Done, done)]);
 }
 
 async fn a_waiting_worker_gets_a_job_as_it_comes(engine: &Arc<dyn Engine>) {

@@ -428,4 +428,55 @@ mod tests {
         assert_eq!(again[0].attempt, 2);
         assert!(matches!(engine.finish(&first[0], Outcome::Canceled).await, Err(EngineError::Fenced { .. })));
     }
+
+    #[tokio::test]
+    async fn a_key_stands_for_its_job_for_a_day_and_no_longer() {
+        const DAY_MS: i64 = 24 * 60 * 60 * 1000;
+        /// Longer than the test takes.
+        const HOUR_MS: i64 = 60 * 60 * 1000;
+        let folder = tempfile::tempdir().expect("folder");
+        let engine = open(folder.path(), Terms::default());
+        let key = IdempotencyKey { key: "k".to_owned(), fingerprint: "one".to_owned() };
+        let keyed = || NewJob { key: Some(key.clone()), ..conformance::new_job() };
+        let age = async |by: i64| {
+            let aged = "UPDATE idempotency SET expires_at = expires_at - ?1";
+            assert_eq!(engine.write(move |ctx| ctx.connection.execute(aged, [by])).await.expect("writes"), 1);
+        };
+        let first = match engine.submit(keyed()).await.expect("submits") {
+            Submitted::Created(job) => job,
+            other => panic!("expected a new job, found {other:?}"),
+        };
+        age(DAY_MS - HOUR_MS).await;
+        assert_eq!(engine.submit(keyed()).await.expect("submits"), Submitted::Replayed(first.clone()));
+        age(HOUR_MS).await;
+        assert_eq!(engine.recall(&Tenant::default(), key.clone()).await.expect("answers"), None);
+        let second = match engine.submit(keyed()).await.expect("submits") {
+            Submitted::Created(job) => job,
+            other => panic!("the key is a day old and stands for nothing, found {other:?}"),
+        };
+        assert_ne!(second.id, first.id);
+        // for a day from then on, again
+        age(DAY_MS - HOUR_MS).await;
+        assert_eq!(engine.submit(keyed()).await.expect("submits"), Submitted::Replayed(second));
+    }
+
+    #[tokio::test]
+    async fn a_database_of_a_newer_program_is_refused_and_left_as_it_is() {
+        let folder = tempfile::tempdir().expect("folder");
+        drop(open(folder.path(), Terms::default()));
+        let path = folder.path().join("shrinkd.sqlite3");
+        let version = |connection: &Connection| {
+            connection.query_row("PRAGMA user_version", [], |row| row.get::<_, u32>(0)).expect("reads")
+        };
+        let newer = {
+            let connection = Connection::open(&path).expect("opens");
+            let newer = version(&connection) + 1;
+            connection.pragma_update(None, "user_version", newer).expect("writes");
+            newer
+        };
+        let Err(error) = SqliteEngine::open(folder.path(), Terms::default()) else { panic!("it was opened") };
+        let said = error.to_string();
+        assert!(said.contains(&format!("version {newer}")) && said.contains("newer than this program"), "{said}");
+        assert_eq!(version(&Connection::open(&path).expect("opens")), newer);
+    }
 }

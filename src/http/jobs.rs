@@ -676,3 +676,43 @@ pub struct ShrinkRequest {
     #[schema(required = false, minimum = 1)]
     deadline_s: Option<u32>,
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn job(state: &str, eta_s: Option<f64>) -> Job {
+        let job = json!({
+            "id": JobId::new(), "kind": "shrink", "state": state, "attempt": 1, "revision": 7, "created_at": "2026-01-01T00:00:00Z",
+            "labels": {}, "eta_s": eta_s, "outputs": [],
+        });
+        serde_json::from_value(job).expect("a job")
+    }
+
+    #[test]
+    fn a_client_is_told_to_look_again_when_the_job_may_have_ended() {
+        let told = |state: &str, eta_s: Option<f64>| {
+            let answer = job_answer(job(state, eta_s)).into_response();
+            answer.headers().get(header::RETRY_AFTER).map(|value| value.to_str().expect("text").to_owned())
+        };
+        for (eta_s, seconds) in [
+            (None, "1"),
+            (Some(0.0), "1"),
+            (Some(0.4), "1"),
+            (Some(7.0), "7"),
+            (Some(7.2), "8"),
+            (Some(29.5), "30"),
+            (Some(1e9), "30"),
+        ] {
+            for state in ["queued", "running", "canceling"] {
+                assert_eq!(told(state, eta_s).as_deref(), Some(seconds), "{state}, {eta_s:?}");
+            }
+        }
+        for state in ["succeeded", "failed", "canceled"] {
+            assert_eq!(told(state, None), None, "{state}");
+        }
+        let answer = job_answer(job("running", None)).into_response();
+        assert_eq!(answer.headers()[header::ETAG], "W/\"7\"");
+    }
+}

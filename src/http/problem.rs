@@ -257,41 +257,141 @@ impl From<Failure> for Problem {
 
 #[cfg(test)]
 mod tests {
+    use super::*;
+    use std::collections::BTreeSet;
     use std::path::Path;
 
-    /// The first words in quotes after every use of a constructor, in all files of the room.
-    fn codes(folder: &Path, found: &mut Vec<String>) {
-        const CONSTRUCTORS: [&str; 6] =
-            ["bad_request(", "not_found(", "conflict(", "unprocessable(", "unavailable(", "Problem::new("];
-        for path in std::fs::read_dir(folder).expect("reads").map(|entry| entry.expect("entry").path()) {
-            if path.is_dir() {
-                codes(&path, found);
+    type Codes = BTreeSet<String>;
+
+    /// A file of the repository; of a source what comes before its tests.
+    fn file(path: impl AsRef<Path>) -> String {
+        let text = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).expect("reads");
+        text.split("#[cfg(test)]").next().unwrap_or_default().to_owned()
+    }
+
+    fn is_code(text: &str) -> bool {
+        !text.is_empty() && text.bytes().all(|b| b.is_ascii_lowercase() || b == b'_')
+    }
+
+    /// The first words in quotes after every use of a constructor, in all files of a folder.
+    fn codes(folder: &str) -> Codes {
+        const CONSTRUCTORS: [&str; 8] = [
+            "bad_request(",
+            "not_found(",
+            "conflict(",
+            "unprocessable(",
+            "unavailable(",
+            "Problem::new(",
+            "Failure::new(",
+            "Self::new(",
+        ];
+        let mut found = Codes::new();
+        let entries = std::fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join(folder)).expect("reads");
+        for entry in entries.map(|entry| entry.expect("entry")) {
+            let path = format!("{folder}/{}", entry.file_name().to_str().expect("text"));
+            if entry.path().is_dir() {
+                found.extend(codes(&path));
                 continue;
             }
-            let text = std::fs::read_to_string(&path).expect("reads");
-            let code = text.split("#[cfg(test)]").next().unwrap_or_default();
-            for constructor in CONSTRUCTORS {
-                for call in code.split(constructor).skip(1) {
-                    let first = call.split('"').nth(1).unwrap_or_default();
-                    let close = call.find(|c| ['"', ')', ';'].contains(&c));
-                    let is_code = !first.is_empty() && first.bytes().all(|b| b.is_ascii_lowercase() || b == b'_');
-                    if is_code && close.is_some_and(|at| call.as_bytes()[at] == b'"') {
-                        found.push(first.to_owned());
-                    }
+            let code = file(path);
+            for call in CONSTRUCTORS.iter().flat_map(|constructor| code.split(constructor).skip(1)) {
+                let first = call.split('"').nth(1).unwrap_or_default();
+                let close = call.find(['"', ')', ';']);
+                if is_code(first) && close.is_some_and(|at| call.as_bytes()[at] == b'"') {
+                    found.insert(first.to_owned());
                 }
             }
         }
+        found
+    }
+
+    /// Codes of faults, which come first in their calls or right after a pointer.
+    fn faults(path: &str, calls: &[&str]) -> Codes {
+        let code = file(path);
+        let calls = calls.iter().flat_map(|call| code.split(call).skip(1));
+        let texts = calls.filter_map(|call| {
+            let quoted = call.split(';').next().unwrap_or_default().split('"').skip(1).step_by(2);
+            quoted.take(2).find(|text| is_code(text)).map(str::to_owned)
+        });
+        texts.collect()
+    }
+
+    /// The codes in a column of the tables below a heading of docs/problems.md.
+    fn documented(heading: &str, column: usize) -> Codes {
+        let text = file("docs/problems.md");
+        let below = text.split(&format!("\n## {heading}\n")).nth(1).unwrap_or_else(|| panic!("no heading {heading:?}"));
+        let section = below.split("\n## ").next().unwrap_or_default();
+        let cells = section.lines().filter_map(|line| line.strip_prefix("| ")?.split(" | ").nth(column));
+        cells.flat_map(|cell| cell.split('`').skip(1).step_by(2).map(str::to_owned)).collect()
+    }
+
+    fn missing<'a>(found: &'a Codes, documented: &'a Codes) -> Vec<&'a String> {
+        found.difference(documented).collect()
     }
 
     #[test]
-    fn every_code_is_documented() {
-        let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-        let documented = std::fs::read_to_string(root.join("docs/problems.md")).expect("reads");
-        let mut found = Vec::new();
-        codes(&root.join("src/http"), &mut found);
-        codes(&root.join("src/grpc"), &mut found);
-        assert!(found.len() > 20, "{found:?}");
-        let missing: Vec<&String> = found.iter().filter(|code| !documented.contains(&format!("`{code}`"))).collect();
-        assert!(missing.is_empty(), "not in docs/problems.md: {missing:?}");
+    fn every_code_of_a_refusal_is_documented() {
+        let mut found = codes("src/http");
+        found.extend(codes("src/grpc"));
+        // what layers around the handlers refuse: a path that is no text, and what no route knows
+        for status in [StatusCode::BAD_REQUEST, StatusCode::NOT_FOUND, StatusCode::INTERNAL_SERVER_ERROR] {
+            found.insert(Problem::from_status(status).code().to_owned());
+        }
+        found.insert(Problem::from(Failure::memory_exceeded(2, 1)).code().to_owned());
+        assert!(found.len() > 30 && found.contains("insufficient_scope"), "{found:?}");
+        assert_eq!(missing(&found, &documented("Of requests", 1)), Vec::<&String>::new());
+    }
+
+    #[test]
+    fn every_code_of_a_job_that_failed_is_documented() {
+        let mut found = codes("src/job");
+        let shrink = file("src/shrink.rs");
+        let of_shapes = shrink.split("pub fn code(&self)").nth(1).and_then(|rest| rest.split("\n    }\n").next());
+        let of_shapes = of_shapes.expect("is there").split('"').skip(1).step_by(2);
+        // a job that was canceled has not failed
+        found.extend(of_shapes.filter(|code| *code != "canceled").map(str::to_owned));
+        found.extend(["surface", "gradient"].map(|what| format!("malformed_{what}")));
+        assert!(file("src/job/pipeline/sensing.rs").contains("malformed_{what}"));
+        for code in ["genus", "diverged", "attempts_exhausted", "unknown_input", "malformed_input"] {
+            assert!(found.contains(code), "{code} is not among {found:?}");
+        }
+        assert_eq!(missing(&found, &documented("Of jobs", 0)), Vec::<&String>::new());
+    }
+
+    #[test]
+    fn the_codes_of_faults_are_those_that_are_documented() {
+        let mut found = Codes::new();
+        for path in [
+            "src/field/input.rs",
+            "src/field/input/network.rs",
+            "src/field/input/options.rs",
+            "src/field/scene/parse.rs",
+            "src/grpc/message.rs",
+            "src/http/jobs.rs",
+            "src/http/jobs/warm_start.rs",
+            "src/job/spec.rs",
+            "src/job/spec/read.rs",
+            "src/notify/target.rs",
+        ] {
+            found.extend(faults(path, &["fault(", "faults.add(", "refused(", "Err((", "code: "]));
+        }
+        // where faults are told by their member
+        found.extend(faults("src/fit/spec.rs", &["code: "]));
+        let documented = documented("Faults", 0);
+        assert_eq!(missing(&found, &documented), Vec::<&String>::new(), "not documented");
+        assert_eq!(missing(&documented, &found), Vec::<&String>::new(), "documented, and never told");
+    }
+
+    #[test]
+    fn what_is_out_of_reach_is_no_fault_of_the_service() {
+        let away = || "the cluster".to_owned();
+        for (problem, code) in [
+            (Problem::from(EngineError::Store(away())), "engine_unavailable"),
+            (Problem::from(EngineError::Stopped), "stopping"),
+        ] {
+            assert_eq!((problem.status(), problem.code()), (StatusCode::SERVICE_UNAVAILABLE, code));
+            assert!(problem.retry_after_s().is_some());
+            assert!(!problem.detail().contains("cluster"), "the cause is for the log");
+        }
     }
 }

@@ -2,6 +2,7 @@
 
 use crate::app::{App, PATIENCE, endless, fixture, small};
 use crate::cluster::nats_server;
+use crate::tenants;
 use client::shrinkd_client::ShrinkdClient;
 use client::{
     CancelRequest, Chunk, DownloadRequest, EstimateRequest, Event, ForgetRequest, GetRequest, Job, ListRequest, State,
@@ -393,6 +394,163 @@ async fn what_is_over_a_quota_is_told_in_the_language_of_the_call() {
     assert!(answer.into_inner().memory_bytes > 1 << 20);
     let details = refused(client.submit(submission(&small())).await, Code::ResourceExhausted, "quota_exceeded");
     assert!(details.retry_info().and_then(|info| info.retry_delay).is_some_and(|delay| delay.as_secs() >= 1));
+}
+
+/// A message with a key, where there is one.
+fn asked<T>(message: T, key: Option<&str>) -> Request<T> {
+    let mut request = Request::new(message);
+    if let Some(key) = key {
+        request.metadata_mut().insert("authorization", format!("Bearer {key}").parse().expect("text"));
+    }
+    request
+}
+
+/// How every method answers about a job and an input, in the order of the contract.
+async fn every_method(
+    client: &mut ShrinkdClient<Channel>,
+    key: Option<&str>,
+    (job, input): (&str, &str),
+) -> Vec<(&'static str, Result<(), Status>)> {
+    let id = || job.to_owned();
+    let spec = json!({"field": {"input": input}});
+    let estimate = EstimateRequest { spec: Some(object(&spec)), json: String::new() };
+    let chunk = Chunk { data: br#"{"sphere": {"radius": 0.125}}"#.to_vec().into() };
+    let download = DownloadRequest { id: id(), name: "glb".to_owned(), offset: 0 };
+    vec![
+        ("Submit", client.submit(asked(submission(&spec), key)).await.map(drop)),
+        ("Estimate", client.estimate(asked(estimate, key)).await.map(drop)),
+        ("Get", client.get(asked(GetRequest { id: id() }, key)).await.map(drop)),
+        ("List", client.list(asked(ListRequest::default(), key)).await.map(drop)),
+        ("Cancel", client.cancel(asked(CancelRequest { id: id() }, key)).await.map(drop)),
+        ("Forget", client.forget(asked(ForgetRequest { id: id() }, key)).await.map(drop)),
+        ("Watch", client.watch(asked(WatchRequest { id: id(), after: None }, key)).await.map(drop)),
+        ("Download", client.download(asked(download, key)).await.map(drop)),
+        ("Upload", client.upload(asked(stream::iter([chunk]), key)).await.map(drop)),
+    ]
+}
+
+/// A service that asks who calls, with an input and an ended job of the tenant `a`.
+struct Guarded {
+    app: App,
+    client: ShrinkdClient<Channel>,
+    folder: tempfile::TempDir,
+    job: String,
+    input: String,
+}
+
+impl Guarded {
+    async fn start() -> Self {
+        let folder = tempfile::tempdir().expect("folder");
+        let app = App::start_with(folder.path(), &[("SHRINKD_AUTH__MODE", "required")]);
+        let mut client = connect(&app).await;
+        let mut new = Self { app, client: client.clone(), folder, job: String::new(), input: String::new() };
+        let key = new.key("a", "read,write").await;
+        let chunk = Chunk { data: br#"{"sphere": {"radius": 0.6}}"#.to_vec().into() };
+        let stored = client.upload(asked(stream::iter([chunk]), Some(&key))).await.expect("stored").into_inner();
+        let mut spec = small();
+        spec["field"] = json!({"input": stored.id});
+        let job = client.submit(asked(submission(&spec), Some(&key))).await.expect("accepted").into_inner();
+        (new.input, new.job) = (stored.id, job.job.expect("a job").id);
+        let events = WatchRequest { id: new.job.clone(), after: None };
+        let events = client.watch(asked(events, Some(&key))).await.expect("a stream").into_inner();
+        let events = tokio::time::timeout(PATIENCE, events.collect::<Vec<_>>()).await.expect("ends with the job");
+        let last = events.into_iter().last().expect("an event").expect("an event");
+        assert_eq!(text(last.data.as_ref().expect("a job"), "state"), "succeeded");
+        new
+    }
+
+    /// A key that works.
+    async fn key(&self, tenant: &str, scopes: &str) -> String {
+        let key = tenants::keys(self.folder.path(), &["create", "--tenant", tenant, "--scope", scopes]);
+        tenants::eventually("the new key works", async || {
+            tenants::ask(&self.app, &key, Method::GET, "/v1/jobs", b"").await.status() != 401
+        })
+        .await;
+        key
+    }
+}
+
+#[tokio::test]
+async fn every_method_asks_for_a_key_and_for_what_it_allows() {
+    let guarded = Guarded::start().await;
+    let (mut client, names) = (guarded.client.clone(), (guarded.job.as_str(), guarded.input.as_str()));
+    let answers = every_method(&mut client, None, names).await;
+    let contract = include_str!("../../proto/shrinkd/v1/shrinkd.proto");
+    let methods = contract.lines().filter_map(|line| line.trim().strip_prefix("rpc ")?.split('(').next());
+    assert_eq!(answers.iter().map(|(method, _)| *method).collect::<Vec<_>>(), methods.collect::<Vec<_>>());
+    for (method, answer) in answers {
+        assert!(answer.is_err(), "{method} needs no key");
+        refused(answer, Code::Unauthenticated, "unauthenticated");
+    }
+    let made_up = format!("shrinkd_{}_{}", "0".repeat(16), "0".repeat(64));
+    for (_, answer) in every_method(&mut client, Some(&made_up), names).await {
+        refused(answer, Code::Unauthenticated, "unauthenticated");
+    }
+    let reader = guarded.key("a", "read").await;
+    for (method, answer) in every_method(&mut client, Some(&reader), names).await {
+        if ["Get", "List", "Watch", "Download"].contains(&method) {
+            assert!(answer.is_ok(), "{method}: {answer:?}");
+        } else {
+            refused(answer, Code::PermissionDenied, "insufficient_scope");
+        }
+    }
+    let operator = guarded.key("a", "operate").await;
+    for (_, answer) in every_method(&mut client, Some(&operator), names).await {
+        refused(answer, Code::PermissionDenied, "insufficient_scope");
+    }
+    // whether the node is well is told to everybody
+    let mut health = HealthClient::new(channel(&guarded.app).await);
+    assert!(serving(health.check(HealthCheckRequest::default()).await.expect("an answer").get_ref()));
+}
+
+#[tokio::test]
+async fn another_tenants_things_answer_on_every_method_as_if_they_had_never_been() {
+    let guarded = Guarded::start().await;
+    let mut client = guarded.client.clone();
+    let stranger = guarded.key("b", "read,write").await;
+    let theirs = (guarded.job.as_str(), guarded.input.as_str());
+    let no_input = format!("sha256:{}", "0".repeat(64));
+    let never = ("01900000-0000-7000-8000-000000000000", no_input.as_str());
+    let mut told = Vec::new();
+    for names in [theirs, never] {
+        let answers = every_method(&mut client, Some(&stranger), names).await;
+        // the same apart from names, and from the id of each request
+        let answers = answers.into_iter().map(|(method, answer)| {
+            let said = answer.map_err(|status| {
+                let details = status.get_error_details();
+                let faults = details.bad_request().map(|faults| format!("{:?}", faults.field_violations));
+                let reason = details.error_info().map(|info| info.reason.clone()).unwrap_or_default();
+                let text = format!("{} {}", status.message(), faults.unwrap_or_default());
+                (status.code(), reason, text.replace(names.0, "JOB").replace(names.1, "INPUT"))
+            });
+            (method, said)
+        });
+        told.push(answers.collect::<Vec<_>>());
+    }
+    assert_eq!(told[0], told[1]);
+    for (method, answer) in &told[0] {
+        let found = answer.as_ref().map_err(|(code, reason, _)| (*code, reason.as_str()));
+        let expected = match *method {
+            "Submit" | "Estimate" => Err((Code::InvalidArgument, "invalid_request")),
+            "Get" | "Cancel" | "Forget" | "Watch" | "Download" => Err((Code::NotFound, "unknown_job")),
+            // its own, of which there are none yet, and a file that is new to it
+            "List" | "Upload" => Ok(&()),
+            other => panic!("{other} is new: what does it tell a stranger?"),
+        };
+        assert_eq!(found, expected, "{method}");
+    }
+    for names in [theirs, never] {
+        let warm = json!({"field": {"scene": {"sphere": {"radius": 0.5}}}, "warm_start": names.0});
+        let answer = client.submit(asked(submission(&warm), Some(&stranger))).await;
+        let details = refused(answer, Code::InvalidArgument, "invalid_request");
+        let faults = &details.bad_request().expect("faults").field_violations;
+        assert!(faults[0].description.starts_with("unknown_job: "), "{faults:?}");
+    }
+    let listed = client.list(asked(ListRequest::default(), Some(&stranger))).await.expect("a page").into_inner();
+    assert_eq!(listed.jobs, []);
+    let owner = guarded.key("a", "read").await;
+    let still = client.get(asked(GetRequest { id: guarded.job.clone() }, Some(&owner))).await.expect("there");
+    assert_eq!(still.into_inner().state(), State::Succeeded, "nothing that the stranger did has touched it");
 }
 
 fn serving(answer: &HealthCheckResponse) -> bool {

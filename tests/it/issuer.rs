@@ -227,3 +227,59 @@ async fn keys_change_and_the_issuer_may_be_away_and_is_not_hammered() {
         assert_eq!(list(&app, &token(&new)).await.status(), 200, "the keys at hand serve on");
     }
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_issuer_with_names_of_its_own_is_understood_as_it_is_configured() {
+    let answers = issuer().await;
+    let keys_at = format!("{}/keys", answers.lock().expect("answers").url);
+    let (rsa, elliptic) = (Key::rsa("one"), Key::elliptic("two"));
+    answers.lock().expect("answers").keys = vec![rsa.public(), elliptic.public()];
+    // nobody answers there, so nothing but the setting tells where the keys are
+    let url = "https://issuer.invalid";
+    let folder = tempfile::tempdir().expect("folder");
+    let app = App::start_with(
+        folder.path(),
+        &[
+            ("SHRINKD_AUTH__MODE", "required"),
+            ("SHRINKD_AUTH__OIDC__ISSUER", url),
+            ("SHRINKD_AUTH__OIDC__AUDIENCE", AUDIENCE),
+            ("SHRINKD_AUTH__OIDC__JWKS_URL", &keys_at),
+            ("SHRINKD_AUTH__OIDC__TENANT_CLAIM", "organization"),
+            ("SHRINKD_AUTH__OIDC__SCOPE_CLAIM", "permissions"),
+            ("SHRINKD_AUTH__OIDC__SCOPE_PREFIX", "surfaces/"),
+            ("SHRINKD_AUTH__OIDC__ALGORITHMS", "[\"ES256\"]"),
+        ],
+    );
+    // what the defaults would go by is there, too, and says something else
+    let token = |changed: Value| {
+        let mut own = json!({"organization": "team-b", "permissions": ["surfaces/read", "surfaces/write"]});
+        for (name, value) in changed.as_object().expect("members") {
+            own[name] = value.clone();
+        }
+        elliptic.sign(&claims(url, own))
+    };
+    let full = token(json!({}));
+    assert_eq!(list(&app, &full).await.status(), 200, "{}", app.log());
+    assert_eq!(list(&app, &token(json!({"permissions": "openid surfaces/read"}))).await.status(), 200);
+    for permissions in [json!(null), json!(["shrinkd:read"]), json!(["read"]), json!("surfaces/write")] {
+        let narrow = token(json!({"permissions": permissions.clone(), "scope": "surfaces/read shrinkd:read"}));
+        let refused = list(&app, &narrow).await;
+        assert_eq!(refused.status(), 403, "{permissions}");
+        problem(refused, 403, "insufficient_scope").await;
+    }
+
+    // whose things they are is said by the claim that is configured
+    let request = app.request(reqwest::Method::POST, "/v1/jobs").bearer_auth(&full).json(&crate::app::small());
+    assert_eq!(request.send().await.expect("an answer").status(), 202);
+    let seen = async |token: &str| {
+        let page: Value = list(&app, token).await.json().await.expect("JSON");
+        page["jobs"].as_array().expect("a list").len()
+    };
+    assert_eq!(seen(&token(json!({"tenant": "somebody else"}))).await, 1);
+    assert_eq!(seen(&token(json!({"organization": "acme"}))).await, 0);
+    problem(list(&app, &token(json!({"organization": null}))).await, 401, "unauthenticated").await;
+
+    let by_another = rsa.sign(&claims(url, json!({"organization": "team-b", "permissions": ["surfaces/read"]})));
+    let refused = problem(list(&app, &by_another).await, 401, "unauthenticated").await;
+    assert!(refused["detail"].as_str().is_some_and(|detail| detail.contains("algorithm")), "{refused}");
+}

@@ -7,6 +7,7 @@ mod certify;
 mod cli;
 mod cluster;
 mod cluster_backup;
+mod collecting;
 mod conditional;
 mod contract;
 mod control;
@@ -26,8 +27,10 @@ mod relaxed;
 #[path = "../support/bucket.rs"]
 mod s3;
 mod sensitivity;
+mod starts;
 mod tenants;
 mod traces;
+mod waiting;
 mod walk;
 mod warm;
 mod webhooks;

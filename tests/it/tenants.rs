@@ -1,8 +1,10 @@
 //! Keys made and revoked by the command line while the service runs, and what a tenant sees of another: nothing.
 
 use super::app::{App, BINARY, PATIENCE, problem, small};
+use super::monitoring::samples;
 use reqwest::{Method, Response};
 use serde_json::Value;
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
 use std::time::{Duration, Instant};
@@ -145,6 +147,122 @@ async fn another_tenants_things_answer_on_every_route_as_if_they_had_never_been(
     assert_eq!(ask(&app, &b, Method::POST, "/v1/inputs", SCENE).await.status(), 200);
     let still = ask(&app, &a, Method::GET, &format!("/v1/jobs/{job}"), b"").await;
     assert_eq!(still.status(), 200, "nothing that b did has touched it");
+}
+
+/// What requests have made the engine and the blob store do, by call and outcome.
+async fn done(app: &App, operator: &str) -> BTreeMap<String, f64> {
+    let told = ask(app, operator, Method::GET, "/metrics", b"").await;
+    assert_eq!(told.status(), 200);
+    let mut told = samples(&told.text().await.expect("text"));
+    // a scrape itself asks how much there is to do
+    told.retain(|series, _| {
+        ["shrinkd_engine_call_duration_seconds_count{", "shrinkd_blob_operation_duration_seconds_count{"]
+            .iter()
+            .any(|name| series.starts_with(name))
+            && !series.contains("call=\"depth\"")
+    });
+    told
+}
+
+/// What was done between two looks.
+fn since(before: &BTreeMap<String, f64>, after: BTreeMap<String, f64>) -> BTreeMap<String, f64> {
+    let more = after.into_iter().map(|(series, count)| {
+        let more = count - before.get(&series).copied().unwrap_or(0.0);
+        (series, more)
+    });
+    more.filter(|(_, more)| *more != 0.0).collect()
+}
+
+/// A gradient that is one, so that it is not what a request is refused for.
+fn gradient() -> Vec<u8> {
+    let header = br#"{"gradient":{"dtype":"F32","shape":[1,3],"data_offsets":[0,12]}}"#;
+    [&(header.len() as u64).to_le_bytes()[..], header, &[0; 12]].concat()
+}
+
+#[tokio::test]
+async fn what_another_tenant_has_is_looked_for_no_longer_than_what_never_was() {
+    let folder = tempfile::tempdir().expect("folder");
+    let [a, b] = ["a", "b"].map(|tenant| keys(folder.path(), &["create", "--tenant", tenant]));
+    let operator = keys(folder.path(), &["create", "--tenant", "c", "--scope", "operate"]);
+    let app = App::start_with(folder.path(), &AUTH);
+    let uploaded = ask(&app, &a, Method::POST, "/v1/inputs", b"{\"sphere\": {\"radius\": 0.5}}").await;
+    let input = uploaded.json::<Value>().await.expect("JSON")["id"].as_str().expect("a name").to_owned();
+    let submitted =
+        app.request(Method::POST, "/v1/jobs").bearer_auth(&a).json(&small()).send().await.expect("an answer");
+    let job = submitted.json::<Value>().await.expect("JSON")["id"].as_str().expect("a name").to_owned();
+    eventually("the job has ended", async || {
+        let seen = ask(&app, &a, Method::GET, &format!("/v1/jobs/{job}"), b"").await.json::<Value>().await;
+        seen.expect("JSON")["state"] == "succeeded"
+    })
+    .await;
+    // the collector looks through the store once at the start, at descriptions, blobs and checkpoints, and then not for an hour
+    eventually("the collector is done", async || {
+        let listed = done(&app, &operator).await;
+        let listed = listed.iter().filter(|(series, _)| series.contains("operation=\"list\"")).map(|(_, count)| count);
+        listed.sum::<f64>() >= 3.0
+    })
+    .await;
+    let (no_job, no_input) = ("01900000-0000-7000-8000-000000000000", format!("sha256:{}", "0".repeat(64)));
+    let of_input = r#"{"field": {"input": "NAME"}}"#;
+    let of_weight = r#"{"field": {"scene": {"sphere": {"radius": 0.5}}}, "weight": {"input": "NAME"}}"#;
+    let of_meshes = r#"{"kind": "fit", "meshes": ["NAME"]}"#;
+    let warm = r#"{"field": {"scene": {"sphere": {"radius": 0.5}}}, "warm_start": "NAME"}"#;
+    // a method, a path, a body, and whether it names an input
+    let mut requests: Vec<(Method, String, Vec<u8>, bool)> = Vec::new();
+    for (body, of_an_input) in [(of_input, true), (of_weight, true), (of_meshes, true), (warm, false)] {
+        for path in ["/v1/jobs", "/v1/jobs?validate_only=true"] {
+            requests.push((Method::POST, path.to_owned(), body.as_bytes().to_vec(), of_an_input));
+        }
+    }
+    for query in ["?wait=1", "/events?after=3", "/outputs/glb"] {
+        requests.push((Method::GET, format!("/v1/jobs/NAME{query}"), Vec::new(), false));
+    }
+    let document = app.get_json("/openapi.json").await;
+    for (path, item) in document["paths"].as_object().expect("paths").iter().filter(|(path, _)| path.contains("{id}")) {
+        for method in item.as_object().expect("operations").keys().filter(|key| *key != "parameters") {
+            let method = Method::from_bytes(method.to_uppercase().as_bytes()).expect("a method");
+            let body = if path.ends_with("/sensitivity") { gradient() } else { Vec::new() };
+            let of_an_input = path.starts_with("/v1/inputs");
+            requests.push((method, path.replace("{id}", "NAME").replace("{name}", "report"), body, of_an_input));
+        }
+    }
+    assert!(requests.len() >= 18, "{requests:?}");
+    for (method, path, body, of_an_input) in requests {
+        let (theirs, never) = if of_an_input { (&*input, &*no_input) } else { (&*job, no_job) };
+        let mut all = Vec::new();
+        for name in [theirs, never] {
+            let before = done(&app, &operator).await;
+            let media_type = if body.starts_with(b"{") { "application/json" } else { "application/octet-stream" };
+            let named = String::from_utf8(body.clone()).map(|body| body.replace("NAME", name).into_bytes());
+            let request = app.request(method.clone(), &path.replace("NAME", name)).bearer_auth(&b);
+            let request = request.header("content-type", media_type).body(named.unwrap_or_else(|_| body.clone()));
+            let answered = answer(request.send().await.expect("an answer"), [theirs, never]).await;
+            all.push((answered, since(&before, done(&app, &operator).await)));
+        }
+        assert_eq!(all[0], all[1], "{method} {path}");
+        assert!(!all[0].1.is_empty(), "{method} {path} was not looked for: {all:?}");
+        assert!([404, 422].contains(&all[0].0.0), "{method} {path}: {all:?}");
+    }
+}
+
+#[tokio::test]
+async fn figures_over_all_tenants_are_for_whoever_operates_the_service() {
+    let folder = tempfile::tempdir().expect("folder");
+    let key = |scope: &str| keys(folder.path(), &["create", "--tenant", "a", "--scope", scope]);
+    let (client, operator) = (key("read,write"), key("operate"));
+    let app = App::start_with(folder.path(), &AUTH);
+    problem(app.get("/metrics").await, 401, "unauthenticated").await;
+    let refused = ask(&app, &client, Method::GET, "/metrics", b"").await;
+    let challenge = refused.headers()["www-authenticate"].to_str().expect("text").to_owned();
+    assert!(challenge.contains("scope=\"operate\""), "{challenge}");
+    problem(refused, 403, "insufficient_scope").await;
+    let told = ask(&app, &operator, Method::GET, "/metrics", b"").await;
+    assert_eq!(told.status(), 200);
+    assert!(told.text().await.expect("text").contains("shrinkd_build_info"));
+    // and who operates it has no part in what tenants do with it
+    problem(ask(&app, &operator, Method::GET, "/v1/jobs", b"").await, 403, "insufficient_scope").await;
+    problem(ask(&app, &operator, Method::POST, "/v1/jobs", b"{}").await, 403, "insufficient_scope").await;
+    assert_eq!(ask(&app, &client, Method::GET, "/v1/jobs", b"").await.status(), 200);
 }
 
 #[test]

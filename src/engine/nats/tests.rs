@@ -78,3 +78,18 @@ async fn keeps_every_promise_of_an_engine() {
     let Some(cluster) = Cluster::start() else { return };
     conformance::run(cluster.node(quick()).await).await;
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_servers_keep_a_key_for_a_day() {
+    let Some(cluster) = Cluster::start() else { return };
+    let node = cluster.node(calm()).await;
+    let layout = &node.node.ledger.layout;
+    let kept = async |stream: &async_nats::jetstream::stream::Stream<()>| {
+        stream.get_info().await.expect("a description").config.max_age
+    };
+    assert_eq!(kept(&layout.keys).await, Duration::from_secs(24 * 60 * 60));
+    // and nothing else goes by its age
+    for stream in [&layout.jobs, &layout.specs] {
+        assert_eq!(kept(stream).await, Duration::ZERO);
+    }
+}
