@@ -33,5 +33,6 @@ if ! "$endpoint" --help >/dev/null 2>&1; then
   "$python" -m venv --clear "$folder/moto"
   "$folder/moto/bin/pip" install --quiet --disable-pip-version-check --root-user-action=ignore 'moto[server]>=5.1' >&2
   ln -sfn ../moto/bin/moto_server "$folder/bin/moto_server"
+  "$endpoint" --help >/dev/null
 fi
 echo "export SHRINKD_MOTO_SERVER='$endpoint'"
