@@ -95,14 +95,15 @@
 //! **Jobs.** What is asked of the service, who runs it and what is kept.
 //!
 //! - [`job`]: the request, its states and events; [`job::pipeline`] is where they meet the numbers, [`job::worker`] runs them.
-//! - [`engine`]: the trait [`Engine`](engine::Engine) (submit, claim, renew, finish, events), one process or a cluster behind it, and the suite that both pass.
+//! - [`engine`]: the trait [`Engine`](engine::Engine) (submit, claim, renew, finish, events), one process or a cluster behind it, and the
+//!   suite that both pass.
 //! - [`blobs`]: inputs and outputs by the hash of their content.
 //! - [`tenant`], [`quota`], [`auth`]: whose a job is, how much of the service that may be, and who asks.
 //! - [`notify`]: who is told of an end.
 //!
 //! **Faces.** They translate, and never compute.
 //!
-//! - [`http`] and [`grpc`]: the same service on one port.
+//! - [`http`](crate::http) and [`grpc`]: the same service on one port.
 //! - [`cli`]: a file per command; its `serve` puts the rooms together.
 //! - [`config`], [`telemetry`]: settings, the log, metrics and traces.
 //!
