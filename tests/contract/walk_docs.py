@@ -111,7 +111,7 @@ class Session:
     """A bash in a folder of its own."""
 
     def __init__(self, program, folder, timeout):
-        self.folder, self.timeout, self.count = folder, timeout, 0
+        self.folder, self.timeout, self.count, self.served = folder, timeout, 0, []
         names = [f"808{digit}" for digit in range(10)] + ["4222"]
         self.ports = dict(zip(names, map(str, free_ports(len(names)))))
         work, bin_, hidden = folder / "work", folder / "bin", folder / "blocks"
@@ -153,6 +153,7 @@ class Session:
         commands = text.rstrip().replace("\\\n", " ").splitlines()
         if any(SERVES.match(one.strip()) for one in commands):
             waits = True
+            self.served.append(said)
             if SERVES.match(commands[-1].strip()) and not commands[-1].rstrip().endswith("&"):
                 text = text.rstrip() + " &\n"
         script.write_text(text)
@@ -230,6 +231,8 @@ def walk(page, program, timeout):
                 print(f"FAIL {place} {wrong}", flush=True)
                 print("  " + block.text.rstrip().replace("\n", "\n  "))
                 print("--- said:\n" + output[-TAIL:].rstrip() + "\n---")
+                for served in session.served:
+                    print("--- the service said:\n" + COLOURS.sub("", served.read_text(errors="replace"))[-TAIL:].rstrip() + "\n---")
                 left = len(blocks) - index - 1
                 if left:
                     print(f"the {left} blocks that follow in {page} were not run", flush=True)
