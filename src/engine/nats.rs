@@ -98,6 +98,17 @@ impl NatsEngine {
     }
 }
 
+impl NatsEngine {
+    /// What answers at an address, in a few words, for a person. Nothing is made there.
+    ///
+    /// # Errors
+    /// When no server answers, or it has no JetStream.
+    pub async fn probe(address: &Address, request_bytes: u64) -> Result<String, EngineError> {
+        let link = Link::open(address, request_bytes).await?;
+        Ok(format!("nats-server {} with JetStream", link.client.server_info().version))
+    }
+}
+
 impl Drop for NatsEngine {
     fn drop(&mut self) {
         self.tasks.iter().for_each(JoinHandle::abort);
@@ -253,7 +264,13 @@ impl Node {
         if info.cluster.is_some_and(|cluster| cluster.leader.is_none_or(|leader| leader.is_empty())) {
             return Err(EngineError::Store("the stream of jobs has no leader".to_owned()));
         }
-        Ok(())
+        // servers without room can still be read
+        let (layout, id) = (&self.ledger.layout, uuid::Uuid::now_v7().to_string());
+        let probe = self.ledger.link.store_once(&layout.keys, &layout.probe(), &Bytes::new(), Expect::Any, &id, false);
+        match probe.await? {
+            Some(_) => Ok(()),
+            None => Err(EngineError::Store("nothing can be stored".to_owned())),
+        }
     }
 }
 

@@ -12,16 +12,18 @@ import sys
 import tempfile
 import time
 
-from support import ENDLESS, PATIENCE_S, ROOT, SMALL, Fault, Proxy, Service
+from support import ENDLESS, PATIENCE_S, ROOT, SMALL, TINY, Fault, Proxy, Service
 
 sys.path.insert(0, str(ROOT / "examples" / "python"))
-import requests  # noqa: E402
-import shrinkd_client  # noqa: E402
-from shrinkd_client import Client, CorruptDownload, JobCanceled, JobFailed, Problem  # noqa: E402
+import requests
+import shrinkd_client
+from shrinkd_client import Client, CorruptDownload, JobCanceled, JobFailed, Problem
 
 # long enough to be killed in the middle, made within seconds
 LONGER = {
-    "field": {"scene": {"smooth_union": {"k": 0.1, "of": [{"box": {"half_extents": [0.5, 0.3, 0.3]}}, {"sphere": {"radius": 0.45}}]}}},
+    "field": {
+        "scene": {"smooth_union": {"k": 0.1, "of": [{"box": {"half_extents": [0.5, 0.3, 0.3]}}, {"sphere": {"radius": 0.45}}]}}
+    },
     "shrink": {"lattice": {"latlong": {"n_theta": 160, "n_phi": 80}}},
     "outputs": ["glb"],
 }
@@ -48,7 +50,7 @@ def raised(kind, call):
     raise AssertionError(f"expected {kind.__name__}, and nothing was raised")
 
 
-def submitted(client, request=SMALL, **options):
+def submitted(client, request=TINY, **options):
     members = {name: value for name, value in request.items() if name != "field"}
     return client.submit(request["field"], **{**members, **options})
 
@@ -84,7 +86,7 @@ def a_pause_is_read_as_seconds_or_as_a_date():
 
 def a_cut_stream_is_taken_up_without_a_gap(service, proxy):
     client = Hasty(proxy.url)
-    job = submitted(client, outputs=["glb", "report"])["id"]
+    job = submitted(client, SMALL, outputs=["glb", "report"])["id"]
     stream = f"GET /v1/jobs/{job}/events"
     # inside of the answer's head, and inside of the second frame of every stream
     proxy.faults = [Fault(stream, bytes=40), *(Fault(stream, frames=1) for _ in range(4))]
@@ -137,7 +139,9 @@ def a_killed_service_is_followed_on(service, proxy):
 
 def a_cut_download_is_whole(service, proxy, folder):
     client = Hasty(proxy.url)
-    job = client.wait(submitted(client, shrink={"lattice": {"octahedral": {"n": 32}}}, outputs=["glb"])["id"], PATIENCE_S)
+    job = client.wait(
+        submitted(client, shrink={**TINY["shrink"], "lattice": {"octahedral": {"n": 32}}}, outputs=["glb"])["id"], PATIENCE_S
+    )
     expected = service.get(f"/v1/jobs/{job['id']}/outputs/glb")
     download = f"GET /v1/jobs/{job['id']}/outputs/glb"
     # before the answer, in its head, and twice in the bytes
@@ -233,7 +237,10 @@ def problems_say_what_is_wrong_and_where(client):
 
 def a_job_is_listed_cancelled_and_forgotten(client, proxy):
     labels = {"test": "list"}
-    made = [submitted(client, labels=labels, shrink={"lattice": {"octahedral": {"n": 8 + i}}})["id"] for i in range(3)]
+    made = [
+        submitted(client, labels=labels, shrink={**TINY["shrink"], "lattice": {"octahedral": {"n": 8 + i}}})["id"]
+        for i in range(3)
+    ]
     for job in made:
         client.wait(job, PATIENCE_S)
     assert [job["id"] for job in client.list(labels=labels, page=2)] == made[::-1]
