@@ -3,6 +3,7 @@
 mod cluster;
 mod disk;
 mod repetition;
+mod worker;
 
 use crate::app::{App, PATIENCE, endless, small, state};
 use crate::walk::follow;
