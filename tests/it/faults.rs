@@ -1,6 +1,7 @@
 //! What survives a kill, and what a stop does to those who are connected.
 
 mod cluster;
+mod crowd;
 mod disk;
 mod repetition;
 mod worker;
