@@ -4,6 +4,7 @@ mod cluster;
 mod crowd;
 mod disk;
 mod repetition;
+mod room;
 mod worker;
 
 use crate::app::{App, PATIENCE, endless, small, state};
