@@ -1,5 +1,6 @@
 //! What survives a kill, and what a stop does to those who are connected.
 
+mod bucket;
 mod cluster;
 mod crowd;
 mod disk;
