@@ -209,7 +209,7 @@ impl Following {
                 return None;
             }
             match &mut self.source {
-                None => match self.open().await {
+                None => match open(&self.client, &self.id, self.after).await {
                     // everything was seen before
                     Ok(None) => return None,
                     Ok(Some(answer)) => {
@@ -235,19 +235,20 @@ impl Following {
             }
         }
     }
+}
 
-    async fn open(&self) -> Result<Option<Response>, Error> {
-        let path = format!("/v1/jobs/{}/events", self.id);
-        let request = || {
-            let request = self.client.request(Method::GET, &path).header("accept", "text/event-stream");
-            match self.after {
-                Some(after) => request.header("last-event-id", after),
-                None => request,
-            }
-        };
-        let answer = patiently(request).await?;
-        Ok((answer.status() != StatusCode::NO_CONTENT).then_some(answer))
-    }
+/// Opens the stream of a job's events after a number; `None` when all were seen.
+async fn open(client: &Client, id: &str, after: Option<u64>) -> Result<Option<Response>, Error> {
+    let path = format!("/v1/jobs/{id}/events");
+    let request = || {
+        let request = client.request(Method::GET, &path).header("accept", "text/event-stream");
+        match after {
+            Some(after) => request.header("last-event-id", after),
+            None => request,
+        }
+    };
+    let answer = patiently(request).await?;
+    Ok((answer.status() != StatusCode::NO_CONTENT).then_some(answer))
 }
 
 /// Makes a request until there is an answer that will not be another one later.

@@ -45,11 +45,12 @@ use super::{
 };
 use crate::job::{Job, JobId, JobSpec, State};
 use crate::tenant::Tenant;
+use bytes::Bytes;
 use feed::Feed;
 use jiff::Timestamp;
 use layout::{Layout, Name};
 use ledger::{Found, Ledger, Step, Version};
-use link::{Link, failed, patiently};
+use link::{Expect, Link, failed, patiently};
 use projection::Projection;
 use std::path::Path;
 use std::sync::Arc;
@@ -266,8 +267,8 @@ impl Node {
         }
         // servers without room can still be read
         let (layout, id) = (&self.ledger.layout, uuid::Uuid::now_v7().to_string());
-        let probe = self.ledger.link.store_once(&layout.keys, &layout.probe(), &Bytes::new(), Expect::Any, &id, false);
-        match probe.await? {
+        let probe = layout.probe();
+        match self.ledger.link.store_once(&layout.keys, &probe, &Bytes::new(), Expect::Any, &id, false).await? {
             Some(_) => Ok(()),
             None => Err(EngineError::Store("nothing can be stored".to_owned())),
         }

@@ -73,7 +73,7 @@ async fn a_bucket_that_answers_with_errors_costs_no_job_and_shows_nothing_half()
     bucket.refuse(500);
     // a scene needs no blob to be accepted, and cannot end without one
     let id = nodes[0].submit(&plain(0.4, &["glb", "report"])).await;
-    let left = |line: &&str| line.contains("left to the next attempt") && line.contains(&id);
+    let left = |line: &&str| line.contains("given back after a pause") && line.contains(&id);
     let failed = || nodes.iter().map(|node| node.log().lines().filter(left).count()).sum::<usize>();
     for status in [500, 503, 403] {
         bucket.refuse(status);

@@ -73,6 +73,7 @@ async fn servers_without_room_refuse_jobs_and_lose_none() {
     }
     assert!(["queued", "running"].contains(&state(&api.get_json(&format!("/v1/jobs/{running}")).await)));
     assert!(api.get("/livez").await.status().is_success());
+    problem(api.get("/readyz").await, 503, "engine_unavailable").await;
 
     server.kill();
     server.give_room(PLENTY);
