@@ -5,6 +5,8 @@
 
 pub mod animate;
 pub mod compare;
+mod completions;
+mod doctor;
 pub mod evaluate;
 pub mod extract;
 pub mod first_job;
@@ -49,9 +51,14 @@ struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     /// Run the service
+    #[command(after_long_help = SERVE_EXAMPLES)]
     Serve(ServeArgs),
+    /// Look at a set-up as `serve` would find it, and say what is wrong with it
+    #[command(after_long_help = doctor::EXAMPLES)]
+    Doctor(NodeArgs),
     /// Wrap one field: exits 0 when the result passed every check (closed, Euler characteristic 2, one chart, no flips, no
     /// self-intersections, nowhere farther than 1 % of the diagonal from the zero level set)
+    #[command(after_long_help = EXTRACT_EXAMPLES)]
     Extract(ExtractArgs),
     /// Wrap a network along a path through its latent space: one GLB with a morph target for every frame and one set of UVs
     #[command(after_long_help = ANIMATE_EXAMPLES)]
@@ -72,17 +79,72 @@ enum Command {
     #[command(after_long_help = keys::EXAMPLES)]
     Keys(keys::KeysArgs),
     /// Print the description of the service (OpenAPI 3.1, YAML)
+    #[command(after_long_help = OPENAPI_EXAMPLES)]
     Openapi,
+    /// Print a script that completes commands in a shell
+    #[command(after_long_help = completions::EXAMPLES)]
+    Completions {
+        /// The shell
+        #[arg(value_enum)]
+        shell: completions::Shell,
+    },
     /// Ask a service whether it is ready: exits 0 when it is
+    #[command(after_long_help = HEALTHCHECK_EXAMPLES)]
     Healthcheck {
         /// Address of the service, such as http://127.0.0.1:8080
         url: String,
     },
 }
 
+/// What `serve --help` ends with.
+const SERVE_EXAMPLES: &str = "\
+Examples:
+  shrinkd serve
+  shrinkd serve --try examples/scenes/fork.json
+  shrinkd serve --config /etc/shrinkd.toml
+  shrinkd serve --engine nats://nats-1:4222 --blobs s3://surfaces/prod --role worker
+
+Every setting is explained in docs/shrinkd.toml, and can be given as a variable: SHRINKD_WORKER__SLOTS=4. SIGTERM and Ctrl-C stop the
+service; jobs that have not ended go back to the queue. Exits 0 when it was told to stop, 1 when it cannot start, 2 on bad usage or a
+configuration that cannot be read.";
+
+/// What `extract --help` ends with.
+const EXTRACT_EXAMPLES: &str = "\
+Examples:
+  shrinkd extract examples/scenes/pawn.json -o pawn.glb --preview pawn.png --filmstrip pawn.strip.png
+  shrinkd extract deepsdf_folder -o chair.glb --latent-row 12
+  shrinkd extract bunny.ply -o bunny.glb --lattice octahedral:72 --report bunny.json
+  shrinkd extract values.npy -o values.glb --domain=-1,-1,-1,1,1,1
+
+Exits 0 when the result passed every check, 1 when it did not (it is written all the same), 2 on bad usage, 3 when the file is no field,
+4 when the shape cannot be wrapped, with the cause.";
+
+/// What `openapi --help` ends with.
+const OPENAPI_EXAMPLES: &str = "\
+Examples:
+  shrinkd openapi > openapi.yaml";
+
+/// What `healthcheck --help` ends with.
+const HEALTHCHECK_EXAMPLES: &str = "\
+Examples:
+  shrinkd healthcheck http://127.0.0.1:8080
+
+Exits 0 when the service is ready, 1 when it is not or does not answer, 2 on bad usage.";
+
 /// Arguments of `serve`.
 #[derive(Debug, Args)]
 pub struct ServeArgs {
+    /// What the node is.
+    #[command(flatten)]
+    pub node: NodeArgs,
+    /// Wrap this field as a first job, and log where its outputs are
+    #[arg(long = "try", value_name = "FIELD")]
+    pub first: Option<PathBuf>,
+}
+
+/// What a node of the service is.
+#[derive(Debug, Args)]
+pub struct NodeArgs {
     /// Address to listen on [default: 127.0.0.1:8080]
     #[arg(long)]
     pub listen: Option<SocketAddr>,
@@ -101,9 +163,6 @@ pub struct ServeArgs {
     /// Configuration file (TOML)
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// Wrap this field as a first job, and log where its outputs are
-    #[arg(long = "try", value_name = "FIELD")]
-    pub first: Option<PathBuf>,
 }
 
 /// Arguments of `extract`.
@@ -330,6 +389,7 @@ Examples:
   shrinkd compare meshes --out results --expect-refusal 'genus/*'
   shrinkd compare meshes --only spot --only bunny --lattice octahedral:144 --no-baseline
   shrinkd compare meshes --only 'genus/*' --on-topology wrap --density reach
+  shrinkd compare examples/scenes --lattice octahedral:72 --side-by-side --out results
 
 Exits 0 when every shape succeeded or was refused as expected, 1 when one did not or the run was interrupted, 2 on bad
 usage, 3 when the folder cannot be read or holds no field.";
@@ -361,6 +421,10 @@ pub struct CompareArgs {
     /// Leave out marching cubes of as many vertices
     #[arg(long)]
     pub no_baseline: bool,
+    /// Run the paper's method, too, and draw marching cubes, the paper's method and ours side by side with their figures, in place of
+    /// the contact sheets
+    #[arg(long, requires = "out", conflicts_with = "no_baseline")]
+    pub side_by_side: bool,
     /// Seconds that a shape may take on one lattice; over that it counts as failed
     #[arg(long, value_name = "SECONDS")]
     pub limit: Option<u64>,
@@ -395,6 +459,8 @@ pub fn run() -> ExitCode {
         Command::Sensitivity(args) => sensitivity::run(&args),
         Command::Keys(args) => keys::run(&args),
         Command::Openapi => openapi(),
+        Command::Doctor(args) => doctor::run(&args),
+        Command::Completions { shell } => completions::run(shell),
         Command::Healthcheck { url } => healthcheck::run(&url),
     }
 }
@@ -412,7 +478,7 @@ fn openapi() -> ExitCode {
 /// Steps of a progress bar.
 const STEPS: u64 = 1000;
 
-/// A bar on a terminal, nothing elsewhere.
+/// A bar on a terminal, nothing elsewhere. It has no colours.
 fn progress_bar() -> ProgressBar {
     let bar = ProgressBar::new(STEPS);
     if let Ok(style) = ProgressStyle::with_template("{bar:40} {percent:>3} % {msg} {elapsed}") {
@@ -435,5 +501,15 @@ mod tests {
     fn the_arguments_are_consistent() {
         use clap::CommandFactory as _;
         Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn every_command_shows_how_it_is_used() {
+        use clap::CommandFactory as _;
+        for command in Cli::command().get_subcommands() {
+            let help = command.get_after_long_help().map(ToString::to_string).unwrap_or_default();
+            let example = format!("\n  shrinkd {}", command.get_name());
+            assert!(help.contains("Examples:") && help.contains(&example), "{} has no examples", command.get_name());
+        }
     }
 }

@@ -71,7 +71,7 @@ pub enum Role {
     All,
     /// Answers requests only.
     Api,
-    /// Runs jobs only; answers nothing but whether it lives and is ready.
+    /// Runs jobs only; answers nothing but whether it lives and is ready, and what it measures.
     Worker,
 }
 

@@ -42,6 +42,11 @@ use tower_http::cors::CorsLayer;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+/// Whether the page for a person was built into this program.
+pub fn has_page() -> bool {
+    web::is_built()
+}
+
 /// What handlers work with.
 #[derive(Clone)]
 pub struct App {

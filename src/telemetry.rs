@@ -19,9 +19,11 @@ use tracing_subscriber::{EnvFilter, Layer as _};
 pub fn start(config: &LogConfig, traces: Option<&Traces>) -> Result<(), tracing_subscriber::filter::ParseError> {
     let filter = EnvFilter::try_new(&config.filter)?;
     let log = tracing_subscriber::fmt::layer().with_writer(std::io::stderr);
+    // https://no-color.org
+    let colours = std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
     let log = match config.format {
         LogFormat::Json => log.json().flatten_event(true).with_filter(filter).boxed(),
-        LogFormat::Pretty => log.with_ansi(std::io::stderr().is_terminal()).with_filter(filter).boxed(),
+        LogFormat::Pretty => log.with_ansi(colours).with_filter(filter).boxed(),
     };
     // fails only when a log was started before, which then stays
     let _ = tracing_subscriber::registry().with(log).with(traces.map(Traces::layer)).try_init();

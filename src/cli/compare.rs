@@ -9,12 +9,14 @@ mod one;
 mod row;
 mod shapes;
 mod sheet;
+mod side_by_side;
 mod summary;
 
 use super::{BAD_INPUT, CompareArgs, FAILED, fail, interrupt};
 use crate::settings::CancelToken;
 use crate::shrink::lattice::LatticeSpec;
-use crate::surface::sheet::{Tile, to_png};
+use crate::surface::sheet::{COLUMNS, Tile, to_png};
+use one::Pictures;
 use row::Row;
 use serde_json::{Map, Value, json};
 use shapes::{Shape, find};
@@ -64,6 +66,7 @@ fn compare(args: &CompareArgs) -> Result<bool, (u8, String)> {
         expected: &args.expect_refusal,
         keep: args.out.as_deref().filter(|_| args.glb),
         draw: args.out.is_some(),
+        side_by_side: args.side_by_side,
         pool: &pool,
         stop: &stop,
     };
@@ -71,7 +74,7 @@ fn compare(args: &CompareArgs) -> Result<bool, (u8, String)> {
         if stop.is_canceled() {
             break;
         }
-        match one::run(shape, &task, &mut |row, picture| log.add(row, picture)) {
+        match one::run(shape, &task, &mut |row, pictures| log.add(row, pictures)) {
             Ok(()) => {}
             Err(one::Ended::Unread(why)) => unread.push((shape.name.clone(), why)),
             Err(one::Ended::Stopped) => break,
@@ -88,7 +91,8 @@ fn compare(args: &CompareArgs) -> Result<bool, (u8, String)> {
 struct Log<'a> {
     rows: Vec<Row>,
     /// Pictures of the rows, in the same order.
-    pictures: Vec<Vec<u8>>,
+    pictures: Vec<Pictures>,
+    side_by_side: bool,
     out: Option<&'a Path>,
     table: Option<(PathBuf, std::fs::File)>,
     json: Option<PathBuf>,
@@ -112,6 +116,7 @@ impl<'a> Log<'a> {
         let mut log = Self {
             rows: Vec::new(),
             pictures: Vec::new(),
+            side_by_side: args.side_by_side,
             out: args.out.as_deref(),
             table,
             json,
@@ -134,10 +139,10 @@ impl<'a> Log<'a> {
         Ok(())
     }
 
-    fn add(&mut self, row: Row, picture: Vec<u8>) -> Result<(), String> {
+    fn add(&mut self, row: Row, pictures: Pictures) -> Result<(), String> {
         self.say(&row.to_markdown()).map_err(|e| e.1)?;
         self.rows.push(row);
-        self.pictures.push(picture);
+        self.pictures.push(pictures);
         self.write_json(&[], true).map_err(|e| e.1)
     }
 
@@ -153,6 +158,9 @@ impl<'a> Log<'a> {
             let (done, all) = (self.rows.len(), self.lattices.len() * (shapes.len() - unread.len()));
             text.push_str(&format!("\nInterrupted after {done} of {all} results.\n"));
         }
+        if self.side_by_side {
+            text.push_str(&side_by_side::to_markdown(&self.rows));
+        }
         self.say(&text)?;
         self.write_json(unread, interrupted)?;
         self.write_sheets()
@@ -163,10 +171,20 @@ impl<'a> Log<'a> {
         let Some(out) = self.out else { return Ok(()) };
         for &lattice in self.lattices {
             let rows = self.rows.iter().zip(&mut self.pictures).filter(|(row, _)| row.lattice == lattice);
-            let tiles: Vec<Tile> = rows.map(|(row, picture)| sheet::tile(row, std::mem::take(picture))).collect();
+            let (kind, columns) =
+                if self.side_by_side { ("side-by-side", side_by_side::COLUMNS) } else { ("contact", COLUMNS) };
+            let tiles: Vec<Tile> = rows
+                .flat_map(|(row, pictures)| {
+                    let pictures = std::mem::take(pictures);
+                    match self.side_by_side {
+                        true => side_by_side::tiles(row, pictures).to_vec(),
+                        false => vec![sheet::tile(row, pictures.own)],
+                    }
+                })
+                .collect();
             if !tiles.is_empty() {
-                let path = out.join(format!("contact-{}.png", row::lattice_name(lattice).replace(':', "-")));
-                std::fs::write(&path, to_png(&tiles)).map_err(|e| told(&path, &e))?;
+                let path = out.join(format!("{kind}-{}.png", row::lattice_name(lattice).replace(':', "-")));
+                std::fs::write(&path, to_png(&tiles, columns)).map_err(|e| told(&path, &e))?;
             }
         }
         Ok(())

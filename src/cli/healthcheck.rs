@@ -11,6 +11,11 @@ const PATIENCE: Duration = Duration::from_secs(3);
 /// Where readiness is told when the address names no path.
 const DEFAULT_PATH: &str = "/readyz";
 
+/// The status line of a service's answer.
+pub(super) fn ask(url: &str) -> std::io::Result<String> {
+    Target::parse(url).ok_or_else(|| std::io::Error::other("no address of a service"))?.ask()
+}
+
 /// Exits 0 when the answer is 200.
 pub fn run(url: &str) -> ExitCode {
     let Some(target) = Target::parse(url) else {

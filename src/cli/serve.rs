@@ -1,7 +1,7 @@
 //! `shrinkd serve`: puts the rooms together and runs them until a signal comes.
 
 use super::open_engine::{open_engine, open_keys};
-use super::{BAD_USAGE, FAILED, ServeArgs, fail, first_job};
+use super::{BAD_USAGE, FAILED, NodeArgs, ServeArgs, fail, first_job};
 use crate::auth::Authenticator;
 use crate::auth::issuer::Issuer;
 use crate::auth::keys::KeyRing;
@@ -31,7 +31,7 @@ const DRAIN: Duration = Duration::from_secs(4);
 
 /// What the command line says; absent members leave the configuration as it is.
 #[derive(Serialize)]
-struct Flags<'a> {
+pub(super) struct Flags<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
     listen: Option<std::net::SocketAddr>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -44,16 +44,21 @@ struct Flags<'a> {
     role: Option<Role>,
 }
 
-/// Runs the service until SIGTERM or SIGINT.
-pub fn run(args: &ServeArgs) -> ExitCode {
-    let flags = Flags {
+/// What the command line says of the configuration.
+pub(super) fn flags(args: &NodeArgs) -> Flags<'_> {
+    Flags {
         listen: args.listen,
         data_dir: args.data.as_deref(),
         engine: args.engine.as_deref(),
         blobs: args.blobs.as_deref(),
         role: args.role,
-    };
-    let config = match Config::load(args.config.as_deref(), flags) {
+    }
+}
+
+/// Runs the service until SIGTERM or SIGINT.
+pub fn run(args: &ServeArgs) -> ExitCode {
+    let (node, first) = (&args.node, args.first.clone());
+    let config = match Config::load(node.config.as_deref(), flags(node)) {
         Ok(config) => config,
         Err(error) => return fail(BAD_USAGE, &error),
     };
@@ -73,7 +78,7 @@ pub fn run(args: &ServeArgs) -> ExitCode {
     if let Err(error) = telemetry::start(&config.log, traces.as_ref()) {
         return fail(BAD_USAGE, &error);
     }
-    let result = runtime.block_on(serve(config, args.first.clone()));
+    let result = runtime.block_on(serve(config, first));
     if let Some(traces) = traces {
         runtime.block_on(traces.stop());
     }

@@ -45,11 +45,12 @@ use super::{
 };
 use crate::job::{Job, JobId, JobSpec, State};
 use crate::tenant::Tenant;
+use bytes::Bytes;
 use feed::Feed;
 use jiff::Timestamp;
 use layout::{Layout, Name};
 use ledger::{Found, Ledger, Step, Version};
-use link::{Link, failed, patiently};
+use link::{Expect, Link, failed, patiently};
 use projection::Projection;
 use std::path::Path;
 use std::sync::Arc;
@@ -95,6 +96,17 @@ impl NatsEngine {
             tokio::spawn(housekeeping::run(Arc::downgrade(&node.ledger))),
         ];
         Ok(Self { node, tasks })
+    }
+}
+
+impl NatsEngine {
+    /// What answers at an address, in a few words, for a person. Nothing is made there.
+    ///
+    /// # Errors
+    /// When no server answers, or it has no JetStream.
+    pub async fn probe(address: &Address, request_bytes: u64) -> Result<String, EngineError> {
+        let link = Link::open(address, request_bytes).await?;
+        Ok(format!("nats-server {} with JetStream", link.client.server_info().version))
     }
 }
 
@@ -253,7 +265,13 @@ impl Node {
         if info.cluster.is_some_and(|cluster| cluster.leader.is_none_or(|leader| leader.is_empty())) {
             return Err(EngineError::Store("the stream of jobs has no leader".to_owned()));
         }
-        Ok(())
+        // servers without room can still be read
+        let (layout, id) = (&self.ledger.layout, uuid::Uuid::now_v7().to_string());
+        let probe = layout.probe();
+        match self.ledger.link.store_once(&layout.keys, &probe, &Bytes::new(), Expect::Any, &id, false).await? {
+            Some(_) => Ok(()),
+            None => Err(EngineError::Store("nothing can be stored".to_owned())),
+        }
     }
 }
 

@@ -89,6 +89,30 @@ impl SqliteEngine {
     }
 }
 
+/// What lies in a folder, in a few words, for a person. Nothing is changed, and a service that runs there is not disturbed.
+///
+/// # Errors
+/// When the database cannot be read, is damaged or is of a newer version, or when another process uses the folder.
+pub fn look(folder: &Path) -> Result<String, EngineError> {
+    let path = folder.join("shrinkd.sqlite3");
+    if !path.exists() {
+        return Ok("nothing there yet".to_owned());
+    }
+    if let Ok(lock) = File::open(folder.join("shrinkd.lock"))
+        && let Err(TryLockError::WouldBlock) = lock.try_lock()
+    {
+        return Err(EngineError::Store(format!("another process uses {}: a service runs there", folder.display())));
+    }
+    let connection = Connection::open_with_flags(&path, rusqlite::OpenFlags::SQLITE_OPEN_READ_ONLY)?;
+    schema::check(&connection)?;
+    let verdict: String = connection.query_row("PRAGMA quick_check(1)", [], |row| row.get(0))?;
+    if verdict != "ok" {
+        return Err(EngineError::Store(format!("{}: {verdict}; restore a backup", path.display())));
+    }
+    let jobs: u64 = connection.query_row("SELECT count(*) FROM jobs", [], |row| row.get(0))?;
+    Ok(format!("{jobs} jobs"))
+}
+
 fn connect(path: &Path) -> Result<Connection, EngineError> {
     let connection = Connection::open(path)?;
     connection.pragma_update(None, "journal_mode", "WAL")?;

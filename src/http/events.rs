@@ -32,6 +32,8 @@ pub struct EventsPage {
     events: Vec<Event>,
     /// The number to ask after for the next page.
     next_after: u64,
+    /// The oldest number that is kept: events before it are gone, and what they told is in the job itself.
+    oldest: u64,
     /// The newest number there is.
     newest: u64,
     /// Whether the job has ended, so that nothing comes after `newest`.
@@ -88,7 +90,7 @@ async fn page(app: &App, tenant: &Tenant, id: JobId, after: u64, limit: usize) -
     let page = page.ok_or_else(|| Problem::unknown_job(&id.to_string()))?;
     let next_after = page.events.last().map_or(after, |event| event.seq);
     let ended = page.job.state.ended();
-    let body = EventsPage { events: page.events, next_after, newest: page.newest, ended };
+    let body = EventsPage { events: page.events, next_after, oldest: page.oldest, newest: page.newest, ended };
     Ok(([(header::CACHE_CONTROL, "no-cache")], Json(body)).into_response())
 }
 

@@ -3,6 +3,7 @@
 //! Handlers return a [`Problem`]; the request's middleware writes it, because only that knows the request's id. Internal
 //! detail goes to the log and never into a problem.
 
+use super::rates;
 use crate::blobs::BlobError;
 use crate::engine::EngineError;
 use crate::field::Fault;
@@ -198,7 +199,12 @@ pub(super) fn render(refused: &Problem, request_id: &str, response: Response) ->
     let mut headers: HeaderMap = parts.headers;
     headers.remove(header::CONTENT_LENGTH);
     for (name, value) in &problem.headers {
-        headers.insert(name, value.clone());
+        // an answer may tell of several quotas
+        if rates::tells(name) {
+            headers.append(name, value.clone())
+        } else {
+            headers.insert(name, value.clone()).is_some()
+        };
     }
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
     headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));

@@ -21,6 +21,11 @@ const MANY: usize = 1024;
 /// When to ask for a stream again that was one too many: nobody knows when another one ends.
 const STREAM_PAUSE: Duration = Duration::from_secs(5);
 
+/// Whether a field tells of a quota.
+pub(super) fn tells(name: &HeaderName) -> bool {
+    *name == RATE_LIMIT || *name == RATE_LIMIT_POLICY
+}
+
 /// What is counted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Rate {

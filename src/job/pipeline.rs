@@ -260,7 +260,7 @@ pub fn make(opened: &Opened, asked: &Asked<'_>, settings: Settings<'_>) -> Resul
             OutputName::Glb => surface::gltf::to_glb(&surface, &lasting, &opened.provenance),
             OutputName::Surface => {
                 let motion = opened.moved_by.as_ref().map(|net| latent_motion(net, &surface.positions, &settings));
-                surface::tensors::to_safetensors(&surface, motion.transpose()?.as_deref())
+                surface::tensors::to_safetensors(&surface, &report.by_triangle, motion.transpose()?.as_deref())
             }
             OutputName::Svg | OutputName::Network | OutputName::Sensitivity => {
                 let detail = format!("{} is not made of a field of dimension 3", output.name());

@@ -40,7 +40,7 @@ const CLAIM_WAIT: Duration = Duration::from_secs(20);
 const BACKOFF: Duration = Duration::from_secs(1);
 /// How often a job that waits for memory looks whether it is still wanted.
 const ROOM_LOOK: Duration = Duration::from_millis(200);
-/// Pause before a job is given back whose inputs or outputs were out of reach; it grows with every attempt, ...
+/// Pause before a job is given back whose inputs or outputs were out of reach, no longer than a lease; it grows with every attempt, ...
 const OUT_OF_REACH: Duration = Duration::from_secs(5);
 /// ... up to so many times that.
 const LONGEST_PAUSE: u32 = 12;
@@ -235,7 +235,7 @@ impl Worker {
         let Some(outcome) = outcome else {
             drop(promise);
             // an outage is no fault of the job's and counts as no loss; nobody knows when it ends
-            let pause = OUT_OF_REACH * claim.attempt.clamp(1, LONGEST_PAUSE);
+            let pause = OUT_OF_REACH.min(claim.lease) * claim.attempt.clamp(1, LONGEST_PAUSE);
             tracing::warn!(
                 pause_s = pause.as_secs(),
                 "the blob store is out of reach; the job is given back after a pause"

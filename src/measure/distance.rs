@@ -48,6 +48,9 @@ pub struct Comparison {
     pub far: Vec<DVec3>,
     /// Where the largest distances were met, scene units: on the surface, on the truth.
     pub worst_places: [DVec3; 2],
+    /// Distance of every triangle of the surface from the truth, scene units: the largest that was met at its corners and at the
+    /// samples on it; where no sample fell on it, the mean of what its neighbours met counts as one.
+    pub by_triangle: Vec<f32>,
 }
 
 impl Comparison {
@@ -57,12 +60,37 @@ impl Comparison {
     }
 }
 
-fn both(there: Tallied, back: Tallied, size: f64) -> Comparison {
+fn both(there: Tallied, back: Tallied, size: f64, by_triangle: Vec<f32>) -> Comparison {
     Comparison {
         closeness: Closeness::both(there.one_way(size), back.one_way(size)),
         worst_places: [there.worst, back.worst],
         far: thinned([there.far, back.far].concat(), APART * size),
+        by_triangle,
     }
+}
+
+/// What [`Comparison::by_triangle`] says, of the distances at samples and at vertices.
+fn by_triangle(surface: Mesh<'_>, samples: &Samples, at_samples: &[f64], at_vertices: &[f64]) -> Vec<f32> {
+    let mut met: Vec<Option<f64>> = vec![None; surface.triangles.len()];
+    let mut around = vec![(0.0, 0u32); surface.vertices.len()];
+    for (&t, &distance) in samples.triangles.iter().zip(at_samples) {
+        let largest = &mut met[t as usize];
+        *largest = Some(largest.map_or(distance, |known| known.max(distance)));
+    }
+    for (triangle, distance) in surface.triangles.iter().zip(&met) {
+        for &v in triangle.iter().filter(|_| distance.is_some()) {
+            let (sum, count) = &mut around[v as usize];
+            (*sum, *count) = (*sum + distance.unwrap_or(0.0), *count + 1);
+        }
+    }
+    let of = |(triangle, met): (&[u32; 3], &Option<f64>)| {
+        let corners = triangle.iter().map(|&v| at_vertices[v as usize]).fold(0.0, f64::max);
+        let (sum, count) =
+            triangle.iter().fold((0.0, 0), |(s, n), &v| (s + around[v as usize].0, n + around[v as usize].1));
+        let inside = met.unwrap_or(if count > 0 { sum / f64::from(count) } else { 0.0 });
+        corners.max(inside) as f32
+    };
+    surface.triangles.iter().zip(&met).map(of).collect()
 }
 
 /// The farthest places, no two of them closer than `apart`.
@@ -102,18 +130,19 @@ pub fn between(
     }
     let size = diagonal(truth.vertices);
     let bar = MAX_DISTANCE * size;
-    let there = one_way(surface, &on_surface, truth, bar, settings)?;
-    let back = one_way(truth, &on_truth, surface, bar, settings)?;
-    Ok(Some(both(there, back, size)))
+    let (there, [at_samples, at_vertices]) = one_way(surface, &on_surface, truth, bar, settings)?;
+    let (back, _) = one_way(truth, &on_truth, surface, bar, settings)?;
+    Ok(Some(both(there, back, size, by_triangle(surface, &on_surface, &at_samples, &at_vertices))))
 }
 
+/// One way, and the distances at samples and at vertices.
 fn one_way(
     from: Mesh<'_>,
     samples: &Samples,
     to: Mesh<'_>,
     bar: f64,
     settings: &Settings<'_>,
-) -> Result<Tallied, Canceled> {
+) -> Result<(Tallied, [Vec<f64>; 2]), Canceled> {
     let nearest = Nearest::new(to.vertices, to.triangles);
     let (from_normals, to_normals) = (unit_normals(from), unit_normals(to));
     let mut tallied = Tallied::default();
@@ -121,10 +150,12 @@ fn one_way(
     for (hit, &t) in hits.iter().zip(&samples.triangles) {
         tallied.add(1.0, hit.distance(), from_normals[t as usize].dot(to_normals[hit.triangle as usize]));
     }
-    tallied.extremes(bar, hits.iter().map(|hit| hit.distance()).zip(samples.points.iter().copied()));
+    let at_samples: Vec<f64> = hits.iter().map(|hit| hit.distance()).collect();
+    tallied.extremes(bar, at_samples.iter().copied().zip(samples.points.iter().copied()));
     let hits = nearest.closest_all(from.vertices, settings)?;
-    tallied.extremes(bar, hits.iter().map(|hit| hit.distance()).zip(from.vertices.iter().copied()));
-    Ok(tallied)
+    let at_vertices: Vec<f64> = hits.iter().map(|hit| hit.distance()).collect();
+    tallied.extremes(bar, at_vertices.iter().copied().zip(from.vertices.iter().copied()));
+    Ok((tallied, [at_samples, at_vertices]))
 }
 
 /// Compares a surface with the field behind `sampler`.
@@ -177,7 +208,9 @@ pub fn to_zero_set(
         back.add(zeros.weights[i], hit.distance(), normals[hit.triangle as usize].dot(zeros.normals[i]));
     }
     back.extremes(bar, hits.iter().map(|hit| hit.distance()).zip(zeros.points.iter().copied()));
-    Ok(Some(both(there, back, size)))
+    let distances: Vec<f64> = landed.iter().map(|(distance, _)| *distance).collect();
+    let (at_samples, at_vertices) = distances.split_at(on_surface.points.len());
+    Ok(Some(both(there, back, size, by_triangle(surface, &on_surface, at_samples, at_vertices))))
 }
 
 /// Distance from every start to the zero set, and the unit gradient where it lands.
@@ -256,6 +289,24 @@ mod tests {
             (Mesh { vertices: &vertices, triangles: &turned }, Mesh { vertices: &vertices, triangles: &triangles });
         let c = with_settings(1, |s| between(a, b, 1000, s).unwrap().unwrap());
         assert!(c.closeness.normal_consistency > 0.9999 && c.closeness.normal_consistency_signed < -0.9999);
+    }
+
+    #[test]
+    fn a_triangle_that_stands_off_is_told_from_the_others() {
+        let (mut vertices, triangles) = sphere_mesh(40, 20, 1.0, DVec3::ZERO);
+        let truth = vertices.clone();
+        let off = triangles[300];
+        off.iter().for_each(|&v| vertices[v as usize] *= 1.1);
+        let (a, b) =
+            (Mesh { vertices: &vertices, triangles: &triangles }, Mesh { vertices: &truth, triangles: &triangles });
+        // too few samples for every triangle to have one
+        let c = with_settings(1, |s| between(a, b, 500, s).unwrap().unwrap());
+        assert_eq!(c.by_triangle.len(), triangles.len());
+        assert!((c.by_triangle[300] - 0.1).abs() < 5e-3, "{}", c.by_triangle[300]);
+        let touches = |t: &[u32; 3]| t.iter().any(|v| off.contains(v));
+        let far = triangles.iter().zip(&c.by_triangle).filter(|(t, _)| !touches(t)).map(|(_, d)| *d);
+        assert!(far.clone().filter(|&d| d > 0.01).count() <= 12, "what is taken from neighbours stays beside them");
+        assert!(far.fold(0.0, f32::max) < 0.1);
     }
 
     #[test]

@@ -72,6 +72,11 @@ pub struct Report {
     pub verdict: Verdict,
     /// Version of shrinkd.
     pub version: String,
+    /// Distance of every triangle from the truth, scene units, see
+    /// [`Comparison::by_triangle`](super::distance::Comparison::by_triangle); written with the surface, not with the report.
+    #[serde(skip)]
+    #[schema(ignore)]
+    pub by_triangle: Vec<f32>,
 }
 
 /// Measures a surface against the field behind `sampler`. `spent` are the evaluations that made the surface, by stage;
@@ -116,6 +121,7 @@ pub fn measure(
         attempts: 1,
         verdict: judge(&certificate, &comparison, vertices),
         version: env!("CARGO_PKG_VERSION").to_owned(),
+        by_triangle: comparison.by_triangle,
     })
 }
 

@@ -110,18 +110,12 @@ fn one(
 ) -> Result<Wrap, Refusal> {
     let settings = *scene.settings();
     let (start, end) = attempt.share;
-    let stage = |name: &'static str, done: f32, front: Option<Front>, energy: Option<f64>, flips: Option<u64>| {
+    let stage = |name: &'static str, done: f32, told: Progress| {
         scene.tally().stage(name);
-        (settings.progress)(Progress {
-            stage: name,
-            fraction: start + (end - start) * done,
-            front,
-            energy,
-            flips,
-            ..Progress::default()
-        });
+        (settings.progress)(Progress { stage: name, fraction: start + (end - start) * done, ..told });
     };
-    stage("contract", 0.0, None, None, None);
+    let nothing = Progress::default;
+    stage("contract", 0.0, nothing());
     let front = contract(scene, attempt.resolution, places)?;
     let frame = front.frame;
     let show = |positions: &[DVec3], triangles: Vec<[u32; 3]>, places: &[DVec3]| Front {
@@ -129,11 +123,21 @@ fn one(
         triangles,
         places: places.iter().map(|d| d.as_vec3().to_array()).collect(),
     };
-    let on_lattice = |at: &OnZero, triangles| show(&at.positions, triangles, &lattice.directions);
-    stage("remesh", 0.25, Some(show(&front.mesh.positions, front.mesh.rings.triangles(), &[])), None, None);
+    let farthest = |at: &OnZero| frame.scale * at.values.iter().fold(0.0, |far: f64, value| far.max(value.abs()));
+    let on_lattice = |at: &OnZero, triangles, flips: usize| Progress {
+        front: Some(show(&at.positions, triangles, &lattice.directions)),
+        max_distance: Some(farthest(at)),
+        flips: Some(flips as u64),
+        ..Progress::default()
+    };
+    let unmapped = |mesh: &Mesh| Progress {
+        front: Some(show(&mesh.positions, mesh.rings.triangles(), &[])),
+        ..Progress::default()
+    };
+    stage("remesh", 0.25, unmapped(&front.mesh));
     let sampler = scene.framed(frame);
     let mesh = base(front, (attempt.fineness * base_vertices(lattice)) as usize, &sampler)?;
-    stage("map", 0.45, Some(show(&mesh.positions, mesh.rings.triangles(), &[])), None, None);
+    stage("map", 0.45, unmapped(&mesh));
     let mut sampling = sampling(&mesh, scene, frame, spec, weight)?;
     let wanting: Vec<DVec3> = places.iter().map(|&p| frame.from_scene(p)).collect();
     denser_at(&mesh, &wanting, attempt.insist, &mut sampling.density);
@@ -154,10 +158,10 @@ fn one(
             fitted(first.directions)?
         }
     };
-    stage("resample", 0.75, None, Some(map.energy), None);
+    stage("resample", 0.75, Progress { energy: Some(map.energy), ..nothing() });
     let mut landing = Landing::new(&mesh, &map, lattice, &settings)?;
     let mapped = show(&mesh.positions, mesh.rings.triangles(), &landing.directions);
-    stage("resample", 0.76, Some(mapped), Some(map.energy), None);
+    stage("resample", 0.76, Progress { front: Some(mapped), energy: Some(map.energy), ..nothing() });
     for round in 1..=attempt.denser {
         let base = Base { mesh: &mesh, directions: &landing.directions };
         let missed = missed(&base, lattice, &landing.positions, settings.cancel)?;
@@ -165,28 +169,28 @@ fn one(
             break;
         }
         map = settled(&mesh, map.directions, &sampling, objective, &settings)?;
-        stage("resample", 0.76 + 0.02 * round as f32, None, Some(map.energy), None);
+        stage("resample", 0.76 + 0.02 * round as f32, Progress { energy: Some(map.energy), ..nothing() });
         landing = Landing::new(&mesh, &map, lattice, &settings)?;
     }
     let Landing { directions, positions: landed, normals } = landing;
     let edge = (mesh.area() / lattice.directions.len() as f64).sqrt();
     let mut at = project(&sampler, landed.clone(), &normals, edge, 1e-3 * edge)?;
-    stage("untangle", 0.85, None, None, None);
+    stage("untangle", 0.85, Progress { max_distance: Some(farthest(&at)), ..nothing() });
     let mut diagonals = vec![false; lattice.quads.len()];
     choose_diagonals(&sampler, lattice, &at, &mut diagonals, |_| true)?;
     let triangles = lattice.triangles(&diagonals);
     let tangle = Tangle::new(&sampler, &triangles, &at.positions);
     let folds = tangle.relax_patches(&mut at, &landed, 2)?;
-    stage("slide", 0.92, Some(on_lattice(&at, triangles.clone())), None, Some(folds as u64));
+    stage("slide", 0.92, on_lattice(&at, triangles.clone(), folds));
     let moved = slide(&sampler, lattice, &triangles, &mut at, edge)?;
     turn_diagonals(&sampler, lattice, &at, &mut diagonals, &moved)?;
     let triangles = lattice.triangles(&diagonals);
-    stage("sharpen", 0.95, Some(on_lattice(&at, triangles)), None, Some(folds as u64));
+    stage("sharpen", 0.95, on_lattice(&at, triangles, folds));
     let blunt = at.positions.clone();
     let base = Base { mesh: &mesh, directions: &directions };
     let diagonals = sharpen(&sampler, &base, lattice, &mut at, diagonals)?;
     let triangles = lattice.triangles(&diagonals);
-    stage("separate", 0.97, Some(on_lattice(&at, triangles)), None, Some(folds as u64));
+    stage("separate", 0.97, on_lattice(&at, triangles, folds));
     let to_scene = |list: &[DVec3]| -> Vec<DVec3> { list.iter().map(|&p| frame.to_scene(p)).collect() };
     let mut wrap = Wrap {
         lattice: lattice.clone(),
@@ -196,7 +200,7 @@ fn one(
         diagonals,
     };
     let left = separate(scene, &mut wrap, &[&to_scene(&blunt), &to_scene(&landed)], places, 0)?;
-    stage("separate", 1.0, None, None, Some(left.folds as u64));
+    stage("separate", 1.0, Progress { flips: Some(left.folds as u64), ..nothing() });
     Ok(wrap)
 }
 

@@ -133,13 +133,13 @@ pub fn contract(scene: &Sampler<'_>, resolution: Resolution, places: &[DVec3]) -
     loop {
         let complex = grid.complex(&settings)?;
         let Marked { target, walls, gaps, narrow } = mark(&sampler, &grid, &complex)?;
-        let inside = carve(&complex, &target, settings.cancel, &mut |inside, level| {
-            if settings.watched {
-                let (positions, triangles) = boundary(&complex, &grid.values, inside, level, &HashMap::new());
-                let positions = positions.iter().map(|&p| frame.to_scene(p).as_vec3().to_array()).collect();
-                let front = Some(shown::Front { positions, triangles, places: Vec::new() });
-                (settings.progress)(Progress { stage: "contract", front, ..Progress::default() });
-            }
+        let levels = if settings.watched { levels(&complex, &target) } else { Vec::new() };
+        let inside = carve(&complex, &target, settings.cancel, &levels, &mut |inside, level| {
+            let (positions, triangles) = boundary(&complex, &grid.values, inside, level, &HashMap::new());
+            let positions = positions.iter().map(|&p| frame.to_scene(p).as_vec3().to_array()).collect();
+            let front = Some(shown::Front { positions, triangles, places: Vec::new() });
+            let max_distance = Some(f64::from(level) * frame.scale);
+            (settings.progress)(Progress { stage: "contract", front, max_distance, ..Progress::default() });
         })?;
         let limit = (OBSTRUCTION * h) as f32;
         let stuck = |i: usize| inside[i] && target[i] > 0.0;
@@ -173,6 +173,15 @@ pub fn contract(scene: &Sampler<'_>, resolution: Resolution, places: &[DVec3]) -
         let mesh = Mesh { positions, rings };
         return Ok(Front { mesh, frame });
     }
+}
+
+/// Distances from the solid, falling, at which a front is worth a look: as parts of half its size.
+fn levels(complex: &Complex, values: &[f32]) -> Vec<f32> {
+    const SHARES: [f64; 7] = [0.5, 0.35, 0.24, 0.16, 0.1, 0.05, 0.02];
+    let solid = (0..complex.len()).filter(|&i| values[i] <= 0.0).map(|i| complex.positions[i]);
+    let (low, high) = solid.fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(l, h), p| (l.min(p), h.max(p)));
+    let half = (0.5 * (high - low).length()).max(0.0);
+    SHARES.iter().map(|share| (share * half) as f32).collect()
 }
 
 fn slope_of(sampler: &Sampler<'_>, grid: &Graded) -> f64 {
@@ -334,15 +343,14 @@ fn volume([a, b, c, d]: [DVec3; 4]) -> f64 {
 }
 
 /// Gives up simple nodes with a positive value, farthest outside first, starting from the outermost layer. Returns which
-/// nodes stay inside. On the way `watch` sees a few times which nodes are left, and the value above which most are gone.
+/// nodes stay inside. `watch` sees which nodes are left when those above each of the `levels`, which fall, are gone, as far as they can be.
 pub(super) fn carve(
     complex: &Complex,
     values: &[f32],
     cancel: &CancelToken,
+    levels: &[f32],
     watch: &mut dyn FnMut(&[bool], f32),
 ) -> Result<Vec<bool>, Canceled> {
-    /// Shares of the largest value at which it is called.
-    const LEVELS: [f32; 6] = [1.0, 0.6, 0.35, 0.2, 0.1, 0.04];
     /// Buckets that positive values are sorted into; within a bucket the order is that of arrival.
     const BUCKETS: usize = 4096;
     let mut inside: Vec<bool> = complex.border.iter().map(|b| !b).collect();
@@ -358,7 +366,7 @@ pub(super) fn carve(
         }
     }
     let (mut current, mut popped) = (BUCKETS - 1, 0u64);
-    let mut levels = LEVELS.into_iter().map(|share| top * share).peekable();
+    let mut levels = levels.iter().copied().filter(|&level| level < top).peekable();
     loop {
         while let Some(level) = levels.next_if(|&level| current <= bucket(level)) {
             watch(&inside, level);

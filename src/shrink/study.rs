@@ -145,7 +145,7 @@ fn look(sampler: &Sampler<'_>, grid: &mut Graded, limit: f32) -> Result<(Complex
     loop {
         let complex = grid.complex(sampler.settings())?;
         let values = mark(sampler, grid, &complex)?.target;
-        let inside = carve(&complex, &values, sampler.settings().cancel, &mut |_, _| {})?;
+        let inside = carve(&complex, &values, sampler.settings().cancel, &[], &mut |_, _| {})?;
         let coarse = |i: &usize| inside[*i] && values[*i] > limit && complex.spacing(*i) > 1.5 * fine;
         let nodes: Vec<(usize, i32)> = (0..complex.len()).filter(coarse).map(|i| (i, complex.sides[i])).collect();
         round += 1;
@@ -252,7 +252,7 @@ fn plug(
     let (mut membranes, mut bridges) = (Vec::<[DVec3; 3]>::new(), Vec::<[DVec3; 3]>::new());
     let mut places = Vec::new();
     for _ in 0..ROUNDS {
-        let inside = carve(complex, values, cancel, &mut |_, _| {})?;
+        let inside = carve(complex, values, cancel, &[], &mut |_, _| {})?;
         let stuck: Vec<bool> = (0..complex.len()).map(|i| inside[i] && values[i] > 0.0).collect();
         let far: Vec<Vec<usize>> =
             complex.clusters(&stuck).into_iter().filter(|c| c.iter().any(|&i| values[i] > limit)).collect();

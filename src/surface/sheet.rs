@@ -5,7 +5,7 @@ use super::lettering;
 use super::raster::{Camera, Model, Paint, render_mesh, smooth_normals};
 use crate::field::mesh::ChartedMesh;
 use crate::settings::{Canceled, Settings};
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 use std::collections::HashMap;
 
 /// Side of one view of a tile, pixels.
@@ -18,10 +18,12 @@ const WIDTH: usize = VIEWS.len() * VIEW;
 const BAR: usize = 2 * lettering::HEIGHT + 9;
 /// Room around a tile, pixels.
 const GAP: usize = 6;
-/// Tiles in a row.
-const COLUMNS: usize = 6;
+/// Tiles in a row of a contact sheet.
+pub const COLUMNS: usize = 6;
 /// Samples per pixel and axis.
 const OVERSAMPLING: usize = 2;
+/// Linear colour of what has no chart.
+const CLAY: [f32; 3] = [0.55, 0.52, 0.48];
 /// The paper that tiles lie on.
 const PAPER: [u8; 3] = [255, 255, 255];
 /// Where there is no picture.
@@ -78,9 +80,23 @@ pub fn picture(mesh: &ChartedMesh, tiles: Tiles, settings: &Settings<'_>) -> Res
         triangles: &mesh.triangles,
         paint: Paint::Checkerboard(&mesh.uv, tiles),
     };
+    views(model, settings)
+}
+
+/// Draws a mesh without a chart, in one colour, from the same two places.
+///
+/// # Errors
+/// When the token is raised.
+pub fn plain_picture(vertices: &[DVec3], triangles: &[[u32; 3]], settings: &Settings<'_>) -> Result<Vec<u8>, Canceled> {
+    let positions: Vec<Vec3> = vertices.iter().map(|p| p.as_vec3()).collect();
+    let normals = smooth_normals(&positions, triangles);
+    views(Model { positions: &positions, normals: &normals, triangles, paint: Paint::Plain(CLAY) }, settings)
+}
+
+fn views(model: Model<'_>, settings: &Settings<'_>) -> Result<Vec<u8>, Canceled> {
     let mut pixels = vec![0; 3 * WIDTH * VIEW];
     for (k, [azimuth, elevation]) in VIEWS.into_iter().enumerate() {
-        let camera = Camera::around(&positions, azimuth.to_radians(), elevation.to_radians());
+        let camera = Camera::around(model.positions, azimuth.to_radians(), elevation.to_radians());
         let view = render_mesh(model, &camera, VIEW, OVERSAMPLING, settings)?;
         for (i, pixel) in view.pixels.iter().enumerate() {
             let at = 3 * (i / VIEW * WIDTH + k * VIEW + i % VIEW);
@@ -90,9 +106,9 @@ pub fn picture(mesh: &ChartedMesh, tiles: Tiles, settings: &Settings<'_>) -> Res
     Ok(pixels)
 }
 
-/// The sheet as a PNG; a sheet without tiles is one blank tile.
-pub fn to_png(tiles: &[Tile]) -> Vec<u8> {
-    let columns = tiles.len().clamp(1, COLUMNS);
+/// The sheet as a PNG with at most so many `columns`; a sheet without tiles is one blank tile.
+pub fn to_png(tiles: &[Tile], columns: usize) -> Vec<u8> {
+    let columns = tiles.len().clamp(1, columns);
     let rows = tiles.len().max(1).div_ceil(columns);
     let (across, down) = (WIDTH + GAP, VIEW + BAR + GAP);
     let (width, height) = (columns * across + GAP, rows * down + GAP);
@@ -143,7 +159,7 @@ mod tests {
         let pixels = with_settings(2, |s| picture(&mesh, Tiles::of(spec), s).unwrap());
         let tile = |mark, pixels| Tile { caption: ["ball".to_owned(), "x".repeat(500)], mark, pixels };
         let tiles = [tile(Mark::Good, pixels), tile(Mark::Bad, Vec::new())];
-        let sheet = image::load_from_memory(&to_png(&tiles)).unwrap().to_rgb8();
+        let sheet = image::load_from_memory(&to_png(&tiles, COLUMNS)).unwrap().to_rgb8();
         assert_eq!(sheet.width() as usize, 2 * (WIDTH + GAP) + GAP);
         let at = |column: usize, x: usize, y: usize| {
             sheet.get_pixel((GAP + column * (WIDTH + GAP) + x) as u32, (GAP + y) as u32).0
@@ -155,6 +171,6 @@ mod tests {
             assert_ne!(middle, corner);
             assert!(!(middle[0] > 150 && middle[1] < 80), "red: seen from behind");
         }
-        assert!(!to_png(&[]).is_empty());
+        assert!(!to_png(&[], COLUMNS).is_empty());
     }
 }

@@ -10,6 +10,7 @@
 //! | `second_form` | [rows, columns, 3] | f32: L, M, N |
 //! | `vertex` | [rows, columns] | u32, the welded vertex of each grid point |
 //! | `triangles` | [n, 3] | u32, welded vertices, counter-clockwise outward |
+//! | `triangle_distance` | \[n\] | f32, scene units: how far each triangle was measured to be from the truth |
 //!
 //! A surface whose chart was relaxed has three more, over the vertices of the chart (m of them):
 //!
@@ -42,9 +43,9 @@ use std::collections::HashMap;
 /// Version of the layout above.
 const FORMAT: u32 = 1;
 
-/// The surface as a safetensors file. `latent_motion` has a row of every vertex, see
+/// The surface as a safetensors file. `by_triangle` is how far every triangle was measured to be from the truth, `latent_motion` has a row of every vertex, see
 /// [`latent_motion`](super::sensitivity::latent_motion).
-pub fn to_safetensors(surface: &Surface, latent_motion: Option<&[f32]>) -> Vec<u8> {
+pub fn to_safetensors(surface: &Surface, by_triangle: &[f32], latent_motion: Option<&[f32]>) -> Vec<u8> {
     let lattice = &surface.lattice;
     let (rows, columns) = (lattice.rows, lattice.columns);
     let forms = forms(surface);
@@ -76,6 +77,10 @@ pub fn to_safetensors(surface: &Surface, latent_motion: Option<&[f32]>) -> Vec<u
             whole(&mut surface.triangles.iter().flatten().copied()),
         ),
     ];
+    if by_triangle.len() == surface.triangles.len() {
+        let distances = by_triangle.iter().flat_map(|d| d.to_le_bytes()).collect();
+        tensors.push(("triangle_distance", Dtype::F32, vec![by_triangle.len()], distances));
+    }
     if let Some(uv) = &surface.relaxed_uv {
         let places = uv.iter().flatten().flat_map(|&c| (c as f32).to_le_bytes()).collect();
         let triangles = &surface.chart_triangles;
@@ -130,8 +135,8 @@ mod tests {
     #[test]
     fn every_tensor_is_there_in_its_shape_and_the_bytes_do_not_change() {
         let surface = sphere_surface(LatticeSpec::Latlong { n_theta: 12, n_phi: 6 }, 0.5);
-        let bytes = to_safetensors(&surface, None);
-        assert_eq!(bytes, to_safetensors(&surface, None));
+        let bytes = to_safetensors(&surface, &[], None);
+        assert_eq!(bytes, to_safetensors(&surface, &[], None));
         let file = SafeTensors::deserialize(&bytes).unwrap();
         for (name, shape) in [
             ("positions", vec![7, 13, 3]),
@@ -165,7 +170,7 @@ mod tests {
                 diagonals[i] = surface.lattice.free[i];
             }
             surface.triangles = surface.lattice.triangles(&diagonals);
-            let read = from_safetensors(&to_safetensors(&surface, None), spec).expect("reads");
+            let read = from_safetensors(&to_safetensors(&surface, &[], None), spec).expect("reads");
             assert_eq!(read, surface.earlier());
             assert!(diagonals.contains(&true) && read.diagonals == diagonals);
         }
@@ -175,7 +180,7 @@ mod tests {
     fn what_is_no_surface_on_the_lattice_is_refused_by_what_is_wrong() {
         let spec = LatticeSpec::Latlong { n_theta: 12, n_phi: 6 };
         let mut surface = sphere_surface(spec, 0.5);
-        let good = to_safetensors(&surface, None);
+        let good = to_safetensors(&surface, &[], None);
         let refusal = |bytes: &[u8], spec| from_safetensors(bytes, spec).expect_err("is refused").to_string();
         for cut in [0, 7, 8, 100, good.len() - 1] {
             assert!(refusal(&good[..cut], spec).contains("no safetensors"), "{cut}");
@@ -186,11 +191,11 @@ mod tests {
         let weights = file(&[("positions", Dtype::F32, vec![1], vec![0; 4])], &json!({"format": FORMAT}));
         assert!(refusal(&weights, spec).contains("metadata"));
         surface.triangles.swap(0, 1);
-        assert!(refusal(&to_safetensors(&surface, None), spec).contains("triangles"));
+        assert!(refusal(&to_safetensors(&surface, &[], None), spec).contains("triangles"));
         surface.triangles.swap(0, 1);
         for wrong in [f32::NAN, f32::INFINITY, 1e7] {
             surface.positions[5][1] = wrong;
-            assert!(refusal(&to_safetensors(&surface, None), spec).contains("of positions is"), "{wrong}");
+            assert!(refusal(&to_safetensors(&surface, &[], None), spec).contains("of positions is"), "{wrong}");
         }
     }
 }

@@ -12,12 +12,11 @@ import sys
 import tempfile
 import urllib.request
 
-from support import PATIENCE_S, ROOT, Fault, Proxy, Service
-
 import bpy
 import numpy
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
+from support import PATIENCE_S, ROOT, Fault, Proxy, Service
 
 RADII = (0.8, 0.5, 0.3)
 SIDES = {"latlong": {"latlong": {"n_theta": 48, "n_phi": 24}}, "octahedral": {"octahedral": {"n": 12}}}
@@ -38,7 +37,9 @@ def run(*arguments, **variables):
     """The script in a process of its own, as Blender would start it."""
     command = [sys.executable, str(ROOT / "examples" / "blender_import.py"), "--", *arguments]
     environment = {name: value for name, value in os.environ.items() if name != "SHRINKD_KEY"}
-    ended = subprocess.run(command, env={**environment, **variables}, capture_output=True, text=True, timeout=PATIENCE_S)
+    ended = subprocess.run(
+        command, env={**environment, **variables}, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     return ended.returncode, ended.stdout, ended.stderr
 
 
@@ -102,7 +103,11 @@ def main():
         with Service(sys.argv[1], data) as service:
             areas = {}
             for name, lattice in SIDES.items():
-                request = {"field": {"scene": {"ellipsoid": {"radii": list(RADII)}}}, "shrink": {"lattice": lattice}, "outputs": ["glb"]}
+                request = {
+                    "field": {"scene": {"ellipsoid": {"radii": list(RADII)}}},
+                    "shrink": {"lattice": lattice},
+                    "outputs": ["glb"],
+                }
                 job = post(service, request)
                 assert job["state"] == "succeeded", job
                 code, told, wrong = run(service.url + "/", job["id"], "--save", str(folder / f"{name}.blend"))
@@ -122,8 +127,8 @@ def main():
             refused("404 unknown_job", service.url, "00000000-0000-7000-8000-000000000000")
             ring = post(service, {**request, "field": {"scene": {"torus": {"major": 0.5, "minor": 0.2}}}})
             assert ring["state"] == "failed" and ring["problem"]["code"] == "genus", ring
-            if not ring["outputs"]:
-                refused(f"job {ring['id']} (failed) has no glb: ", service.url, ring["id"])
+            assert not ring["outputs"], ring["outputs"]
+            refused(f"job {ring['id']} (failed) has no glb: {ring['problem']['detail']}", service.url, ring["id"])
             line = post(service, {"field": {"scene": {"circle": {"radius": 0.5}}}, "outputs": ["glb"]})
             code, told, wrong = run(service.url, line["id"])
             assert code == 0 and "imported" in told, (told, wrong)

@@ -12,16 +12,18 @@ import sys
 import tempfile
 import time
 
-from support import ENDLESS, PATIENCE_S, ROOT, SMALL, Fault, Proxy, Service
+from support import ENDLESS, PATIENCE_S, ROOT, SMALL, TINY, Fault, Proxy, Service
 
 sys.path.insert(0, str(ROOT / "examples" / "python"))
-import requests  # noqa: E402
-import shrinkd_client  # noqa: E402
-from shrinkd_client import Client, CorruptDownload, JobCanceled, JobFailed, Problem  # noqa: E402
+import requests
+import shrinkd_client
+from shrinkd_client import Client, CorruptDownload, JobCanceled, JobFailed, Problem
 
 # long enough to be killed in the middle, made within seconds
 LONGER = {
-    "field": {"scene": {"smooth_union": {"k": 0.1, "of": [{"box": {"half_extents": [0.5, 0.3, 0.3]}}, {"sphere": {"radius": 0.45}}]}}},
+    "field": {
+        "scene": {"smooth_union": {"k": 0.1, "of": [{"box": {"half_extents": [0.5, 0.3, 0.3]}}, {"sphere": {"radius": 0.45}}]}}
+    },
     "shrink": {"lattice": {"latlong": {"n_theta": 160, "n_phi": 80}}},
     "outputs": ["glb"],
 }
@@ -48,7 +50,7 @@ def raised(kind, call):
     raise AssertionError(f"expected {kind.__name__}, and nothing was raised")
 
 
-def submitted(client, request=SMALL, **options):
+def submitted(client, request=TINY, **options):
     members = {name: value for name, value in request.items() if name != "field"}
     return client.submit(request["field"], **{**members, **options})
 
@@ -84,7 +86,7 @@ def a_pause_is_read_as_seconds_or_as_a_date():
 
 def a_cut_stream_is_taken_up_without_a_gap(service, proxy):
     client = Hasty(proxy.url)
-    job = submitted(client, outputs=["glb", "report"])["id"]
+    job = submitted(client, SMALL, outputs=["glb", "report"])["id"]
     stream = f"GET /v1/jobs/{job}/events"
     # inside of the answer's head, and inside of the second frame of every stream
     proxy.faults = [Fault(stream, bytes=40), *(Fault(stream, frames=1) for _ in range(4))]
@@ -98,6 +100,12 @@ def a_cut_stream_is_taken_up_without_a_gap(service, proxy):
     assert resumed, proxy.heads(stream.lower())
     # the service asks for two seconds
     assert client.rests.count(2.0) == 5, client.rests
+    # another one may ask for more
+    frame = b'id: 1\nevent: state\ndata: {"attempt":0,"state":"queued"}\nretry: 5000\n\n'
+    head = b"HTTP/1.1 200 OK\r\ncontent-type: text/event-stream\r\nconnection: close\r\n\r\n"
+    proxy.faults = [Fault(stream, answer=head + frame)]
+    again = [(event.seq, event.kind, event.data) for event in client.follow(job, after=0)]
+    assert again == seen and client.rests[-1] == 5.0, client.rests
     # whoever has seen everything is sent away, and a newcomer is told what there is
     assert list(client.follow(job, after=len(seen))) == []
     late = list(client.follow(job))
@@ -117,27 +125,33 @@ def a_cut_stream_is_taken_up_without_a_gap(service, proxy):
     return f"{len(seen)} events over 6 connections"
 
 
-def a_killed_service_is_followed_on(service, proxy):
-    client = Hasty(proxy.url)
-    job = submitted(client, LONGER)["id"]
-    killed, seen = False, []
-    for event in client.follow(job, after=0):
-        seen.append((event.seq, event.kind, event.data))
-        if event.kind == "progress" and not killed:
-            killed = True
-            service.kill()
-            service.start()
-            proxy.target = service.address
-    assert killed and seen == events_of(service, job)
-    assert [number for number, _, _ in seen] == list(range(1, len(seen) + 1)), [number for number, _, _ in seen]
-    assert seen[-1][2]["state"] == "succeeded" and seen[-1][2]["attempt"] == 2, seen[-1]
-    assert client.wait(job)["attempt"] == 2
+def a_killed_service_is_followed_on(program, folder):
+    # the job is taken up again soon; on a machine so busy that heartbeats are late, more often than once, and never too often
+    settings = {"SHRINKD_WORKER__LEASE_S": "5", "SHRINKD_WORKER__MAX_LOSSES": "1000"}
+    with Service(program, folder, settings) as service:
+        proxy = Proxy(service.address)
+        client = Hasty(proxy.url)
+        job = submitted(client, LONGER)["id"]
+        killed, seen = False, []
+        for event in client.follow(job, after=0):
+            seen.append((event.seq, event.kind, event.data))
+            if event.kind == "progress" and not killed:
+                killed = True
+                service.kill()
+                service.start()
+                proxy.target = service.address
+        assert killed and seen == events_of(service, job)
+        assert [number for number, _, _ in seen] == list(range(1, len(seen) + 1)), [number for number, _, _ in seen]
+        assert seen[-1][2]["state"] == "succeeded" and seen[-1][2]["attempt"] >= 2, seen[-1]
+        assert client.wait(job)["attempt"] >= 2
     return f"{len(seen)} events over two lives of the service"
 
 
 def a_cut_download_is_whole(service, proxy, folder):
     client = Hasty(proxy.url)
-    job = client.wait(submitted(client, shrink={"lattice": {"octahedral": {"n": 32}}}, outputs=["glb"])["id"], PATIENCE_S)
+    job = client.wait(
+        submitted(client, shrink={**TINY["shrink"], "lattice": {"octahedral": {"n": 32}}}, outputs=["glb"])["id"], PATIENCE_S
+    )
     expected = service.get(f"/v1/jobs/{job['id']}/outputs/glb")
     download = f"GET /v1/jobs/{job['id']}/outputs/glb"
     # before the answer, in its head, and twice in the bytes
@@ -193,7 +207,7 @@ def a_submit_whose_answer_was_lost_is_one_job(proxy):
     assert (reused.status, reused.code) == (422, "idempotency_key_reused"), reused
 
 
-def tries_are_bounded(service, proxy):
+def tries_are_bounded(proxy):
     client = Hasty(proxy.url, tries=3)
     proxy.faults = [Fault("GET /v1/jobs", answer=REFUSAL) for _ in range(3)]
     refused = raised(Problem, lambda: list(client.list()))
@@ -233,7 +247,10 @@ def problems_say_what_is_wrong_and_where(client):
 
 def a_job_is_listed_cancelled_and_forgotten(client, proxy):
     labels = {"test": "list"}
-    made = [submitted(client, labels=labels, shrink={"lattice": {"octahedral": {"n": 8 + i}}})["id"] for i in range(3)]
+    made = [
+        submitted(client, labels=labels, shrink={**TINY["shrink"], "lattice": {"octahedral": {"n": 8 + i}}})["id"]
+        for i in range(3)
+    ]
     for job in made:
         client.wait(job, PATIENCE_S)
     assert [job["id"] for job in client.list(labels=labels, page=2)] == made[::-1]
@@ -299,19 +316,18 @@ def main():
     program = sys.argv[1]
     a_stream_is_read_however_it_is_cut()
     a_pause_is_read_as_seconds_or_as_a_date()
-    with tempfile.TemporaryDirectory() as made, tempfile.TemporaryDirectory() as data:
-        # a killed worker's job is to be taken up again soon
-        with Service(program, data, {"SHRINKD_WORKER__LEASE_S": "3"}) as service:
-            proxy = Proxy(service.address)
-            with Client(proxy.url) as client:
-                streamed = a_cut_stream_is_taken_up_without_a_gap(service, proxy)
-                downloaded = a_cut_download_is_whole(service, proxy, pathlib.Path(made))
-                a_submit_whose_answer_was_lost_is_one_job(proxy)
-                tries_are_bounded(service, proxy)
-                problems_say_what_is_wrong_and_where(client)
-                a_job_is_listed_cancelled_and_forgotten(client, proxy)
-                a_network_is_uploaded_and_differentiated(client, pathlib.Path(made))
-                survived = a_killed_service_is_followed_on(service, proxy)
+    with tempfile.TemporaryDirectory() as made, tempfile.TemporaryDirectory() as data, Service(program, data) as service:
+        proxy, folder = Proxy(service.address), pathlib.Path(made)
+        with Client(proxy.url) as client:
+            streamed = a_cut_stream_is_taken_up_without_a_gap(service, proxy)
+            downloaded = a_cut_download_is_whole(service, proxy, folder)
+            a_submit_whose_answer_was_lost_is_one_job(proxy)
+            tries_are_bounded(proxy)
+            problems_say_what_is_wrong_and_where(client)
+            a_job_is_listed_cancelled_and_forgotten(client, proxy)
+            a_network_is_uploaded_and_differentiated(client, folder)
+    with tempfile.TemporaryDirectory() as data:
+        survived = a_killed_service_is_followed_on(program, data)
     with tempfile.TemporaryDirectory() as data:
         a_key_is_brought_along(program, data)
     print(f"{streamed}, {survived}, {downloaded}: nothing missed, nothing twice")

@@ -13,9 +13,15 @@ import threading
 import time
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
-PATIENCE_S = 120
+PATIENCE_S = 300
 
-# two balls that flow into each other, on a lattice of some thousand vertices: made at once
+# made at once
+TINY = {
+    "field": {"scene": {"sphere": {"radius": 0.6}}},
+    "shrink": {"method": "paper", "lattice": {"latlong": {"n_theta": 32, "n_phi": 16}}},
+    "outputs": ["glb"],
+}
+# two balls that flow into each other, on a lattice of some thousand vertices
 SMALL = {
     "field": {
         "scene": {
@@ -131,7 +137,7 @@ class Proxy:
 
     @property
     def url(self):
-        return "http://127.0.0.1:%d" % self.listener.getsockname()[1]
+        return f"http://127.0.0.1:{self.listener.getsockname()[1]}"
 
     def heads(self, line):
         """The heads of the requests that began so."""

@@ -4,8 +4,8 @@
 set -euo pipefail
 context="$(mktemp -d)"
 trap 'rm -rf "$context"' EXIT
-# the first stage's copies, each with its sources before its target
-sed -n '1,/^FROM .*nonroot/p' "$1" | grep '^COPY ' | grep -v -- '--from=' | while read -r _ paths; do
+# the copies of the stage that builds it, each with its sources before its target
+sed -n '/^FROM rust/,/^FROM .*nonroot/p' "$1" | grep '^COPY ' | grep -v -- '--from=' | while read -r _ paths; do
   read -ra words <<<"$paths"
   target="$context/${words[-1]}"
   for source in "${words[@]::${#words[@]}-1}"; do

@@ -31,8 +31,13 @@ impl App {
 
     /// Starts a service in a folder, with further variables.
     pub fn start_with(folder: &Path, variables: &[(&str, &str)]) -> Self {
+        Self::start_at(folder, "127.0.0.1:0", variables)
+    }
+
+    /// Starts a service in a folder, at an address, with further variables.
+    pub fn start_at(folder: &Path, listen: &str, variables: &[(&str, &str)]) -> Self {
         let mut command = Command::new(BINARY);
-        command.args(["serve", "--listen", "127.0.0.1:0", "--data"]).arg(folder);
+        command.args(["serve", "--listen", listen, "--data"]).arg(folder);
         // two threads, so that what takes long here takes long on a machine with many cores, too
         command.env("SHRINKD_LOG__FORMAT", "json").env("SHRINKD_WORKER__THREADS", "2").envs(variables.iter().copied());
         let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("the program starts");

@@ -1,7 +1,12 @@
 //! What survives a kill, and what a stop does to those who are connected.
 
+mod bucket;
 mod cluster;
+mod crowd;
 mod disk;
+mod repetition;
+mod room;
+mod worker;
 
 use crate::app::{App, PATIENCE, endless, small, state};
 use crate::walk::follow;
@@ -9,7 +14,7 @@ use eventsource_stream::Eventsource;
 use futures::StreamExt;
 use reqwest::Method;
 use serde_json::{Value, json};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// Long enough to be killed in the middle, short enough to be waited for.
 fn lengthy() -> Value {
@@ -17,6 +22,49 @@ fn lengthy() -> Value {
         "field": {"scene": {"ellipsoid": {"radii": [0.7, 0.5, 0.4]}}},
         "shrink": {"method": "paper", "lattice": {"latlong": {"n_theta": 200, "n_phi": 100}}},
     })
+}
+
+/// Submits under a key as a client does, which repeats what it is told to repeat and nothing else: the job's name, and whether the
+/// answer says that it repeats an earlier one.
+async fn submit_keyed(app: &App, key: &str, body: &Value) -> (String, bool) {
+    let clock = Instant::now();
+    loop {
+        let request = app.request(Method::POST, "/v1/jobs").header("Idempotency-Key", key).json(body);
+        let answer = request.send().await.expect("an answer");
+        let (status, headers) = (answer.status().as_u16(), answer.headers().clone());
+        let told: Value = answer.json().await.expect("JSON");
+        if matches!(status, 200 | 202) {
+            let is_repetition = headers.get("idempotent-replayed").is_some_and(|value| value == "true");
+            return (told["id"].as_str().expect("a name").to_owned(), is_repetition);
+        }
+        let code = told["code"].as_str().unwrap_or_default();
+        let known = [(503, "engine_unavailable")];
+        assert!(known.contains(&(status, code)), "{status}: {told}");
+        assert!(headers.contains_key("retry-after"), "it says when to ask again: {told}");
+        assert!(clock.elapsed() < PATIENCE, "still {told}\n{}", app.log());
+        tokio::time::sleep(Duration::from_millis(200)).await;
+    }
+}
+
+/// A small job that is found by its label. It makes no picture, which would take longer than the rest of it.
+fn labeled(round: &str) -> Value {
+    let mut body = small();
+    body["outputs"] = json!(["report"]);
+    body["labels"] = json!({ "round": round });
+    body
+}
+
+/// The names of the jobs with a label.
+async fn jobs_labeled(app: &App, round: &str) -> Vec<String> {
+    let listed = app.get_json(&format!("/v1/jobs?label=round:{round}")).await;
+    let jobs = listed["jobs"].as_array().expect("a list").iter();
+    jobs.map(|job| job["id"].as_str().expect("a name").to_owned()).collect()
+}
+
+/// The states that events tell of, with their attempts.
+fn states(events: &[(u64, String, Value)]) -> Vec<(&str, u64)> {
+    let told = events.iter().filter(|event| event.1 == "state");
+    told.map(|event| (state(&event.2), event.2["attempt"].as_u64().expect("a number"))).collect()
 }
 
 /// The numbers and kinds of a job's events, until one is of this kind.
@@ -55,12 +103,7 @@ async fn a_job_that_was_killed_in_the_middle_runs_again_and_its_reader_misses_no
         let after = follow(&app, &id, Some(last)).await;
         let all = [before, after].concat();
         assert_eq!(all.iter().map(|e| e.0).collect::<Vec<_>>(), (1..=all.len() as u64).collect::<Vec<_>>());
-        let states: Vec<(&str, u64)> = all
-            .iter()
-            .filter(|e| e.1 == "state")
-            .map(|e| (state(&e.2), e.2["attempt"].as_u64().expect("a number")))
-            .collect();
-        assert_eq!(states, [("queued", 0), ("running", 1), ("queued", 1), ("running", 2), ("succeeded", 2)]);
+        assert_eq!(states(&all), [("queued", 0), ("running", 1), ("queued", 1), ("running", 2), ("succeeded", 2)]);
         assert_eq!(all.last().map(|e| e.1.as_str()), Some("done"));
         assert_eq!(follow(&app, &id, Some(0)).await, all, "what was told before the kill is told the same after it");
         return;

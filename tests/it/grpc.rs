@@ -453,8 +453,8 @@ impl Guarded {
         (new.input, new.job) = (stored.id, job.job.expect("a job").id);
         let events = WatchRequest { id: new.job.clone(), after: None };
         let events = client.watch(asked(events, Some(&key))).await.expect("a stream").into_inner();
-        let events = tokio::time::timeout(PATIENCE, events.collect::<Vec<_>>()).await.expect("ends with the job");
-        let last = events.into_iter().last().expect("an event").expect("an event");
+        let mut events = tokio::time::timeout(PATIENCE, events.collect::<Vec<_>>()).await.expect("ends with the job");
+        let last = events.pop().expect("an event").expect("an event");
         assert_eq!(text(last.data.as_ref().expect("a job"), "state"), "succeeded");
         new
     }

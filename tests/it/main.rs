@@ -5,6 +5,7 @@ mod backup;
 mod bucket;
 mod certify;
 mod cli;
+mod client;
 mod cluster;
 mod cluster_backup;
 mod collecting;

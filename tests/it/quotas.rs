@@ -159,3 +159,31 @@ async fn a_job_that_needs_too_much_memory_is_refused_before_it_runs() {
     let id = app.submit(&small()).await;
     assert_eq!(state(&app.ended(&id).await), "succeeded");
 }
+
+#[tokio::test]
+async fn streams_and_uploads_are_bounded_and_an_answer_tells_of_every_quota() {
+    let folder = tempfile::tempdir().expect("folder");
+    let limits = [
+        ("SHRINKD_QUOTAS__DEFAULT__STREAMS", "1"),
+        ("SHRINKD_QUOTAS__DEFAULT__REQUESTS_PER_MINUTE", "1000"),
+        ("SHRINKD_LIMITS__UPLOAD_BYTES", "1000"),
+    ];
+    let app = App::start_with(folder.path(), &limits);
+    let id = app.submit(&endless()).await;
+    let path = format!("/v1/jobs/{id}/events");
+    let open = app.get(&path).await;
+    assert_eq!(open.status(), StatusCode::OK);
+    let second = app.get(&path).await;
+    let told: Vec<&str> = second.headers().get_all("ratelimit").iter().map(|v| v.to_str().expect("text")).collect();
+    assert!(told.len() == 2 && told[0].contains("requests_per_minute") && told[1].contains("streams"), "{told:?}");
+    problem(second, 429, "quota_exceeded").await;
+    problem(app.get(&format!("/v1/jobs/{id}?wait=30")).await, 429, "quota_exceeded").await;
+    drop(open);
+    eventually("a stream that ended makes room", async || app.get(&path).await.status() == StatusCode::OK).await;
+    // more than all uploads together may be
+    let upload = app.request(Method::POST, "/v1/inputs").body(vec![b' '; 2000]).send().await.expect("an answer");
+    problem(upload, 503, "uploads_full").await;
+    let scene = json!({"sphere": {"radius": 0.5}}).to_string();
+    let upload = app.request(Method::POST, "/v1/inputs").body(scene).send().await.expect("an answer");
+    assert_eq!(upload.status(), StatusCode::CREATED, "what was refused holds nothing");
+}

@@ -30,7 +30,8 @@ pub async fn frames(response: reqwest::Response) -> Vec<(u64, String, Value)> {
     events
 }
 
-fn hex(bytes: &[u8]) -> String {
+/// The SHA-256 of bytes, as outputs and inputs are named by it.
+pub fn hex(bytes: &[u8]) -> String {
     Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
 }
 

@@ -6,22 +6,41 @@
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 
 /// Longer than the server takes to start on the slowest machine.
 const START: Duration = Duration::from_secs(60);
-/// The delay that stands for "every connection is cut".
-const CUT: u64 = u64::MAX;
+
+/// What the proxy does with what comes.
+#[derive(Clone, Copy)]
+enum Manner {
+    /// Passes it on, this much later.
+    PassOn(Duration),
+    /// Cuts every connection.
+    Cut,
+    /// Passes on so many bytes of what the server says on a connection, and then cuts it.
+    CutAfter(usize),
+    /// Answers every request itself, with this status.
+    Refuse(u16),
+}
 
 /// A bucket named `shrinkd`.
 pub struct Bucket {
     child: Child,
     /// Where clients go: the proxy.
     address: SocketAddr,
-    /// Milliseconds that the proxy waits before it passes anything on, or [`CUT`].
-    delay: Arc<AtomicU64>,
+    proxy: Arc<Proxy>,
+}
+
+/// What stands between the clients and the server.
+struct Proxy {
+    server: SocketAddr,
+    manner: Mutex<Manner>,
+    /// Requests that were refused and connections that were cut.
+    failures: AtomicUsize,
 }
 
 impl Bucket {
@@ -42,19 +61,21 @@ impl Bucket {
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
         let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
-        let (address, delay) = (listener.local_addr().expect("an address"), Arc::new(AtomicU64::new(0)));
+        let address = listener.local_addr().expect("an address");
+        let manner = Mutex::new(Manner::PassOn(Duration::ZERO));
+        let proxy = Arc::new(Proxy { server, manner, failures: AtomicUsize::new(0) });
         listener.set_nonblocking(true).expect("a socket");
         // a thread of its own: tests wait for their services without giving way to other tasks
         std::thread::spawn({
-            let delay = delay.clone();
+            let proxy = proxy.clone();
             move || {
                 let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
                 runtime.block_on(async {
-                    pass_on(tokio::net::TcpListener::from_std(listener).expect("a socket"), server, delay).await;
+                    stand_between(tokio::net::TcpListener::from_std(listener).expect("a socket"), proxy).await;
                 });
             }
         });
-        let bucket = Self { child, address, delay };
+        let bucket = Self { child, address, proxy };
         let made =
             reqwest::Client::new().put(format!("{}/shrinkd", bucket.endpoint())).send().await.expect("an answer");
         assert!(made.status().is_success(), "{made:?}");
@@ -80,12 +101,30 @@ impl Bucket {
 
     /// Cuts every connection from now on.
     pub fn cut(&self) {
-        self.delay.store(CUT, Ordering::SeqCst);
+        self.proxy.behave(Manner::Cut);
     }
 
     /// Passes everything on, this much later.
     pub fn delay(&self, by: Duration) {
-        self.delay.store(by.as_millis() as u64, Ordering::SeqCst);
+        self.proxy.behave(Manner::PassOn(by));
+    }
+
+    /// Passes on so many bytes of the server's answers on each connection from now on, and then cuts it.
+    #[allow(dead_code, reason = "not every program that includes this file needs it")]
+    pub fn cut_after(&self, bytes: usize) {
+        self.proxy.behave(Manner::CutAfter(bytes));
+    }
+
+    /// Answers every request with this status from now on; what is under way is cut.
+    #[allow(dead_code, reason = "not every program that includes this file needs it")]
+    pub fn refuse(&self, status: u16) {
+        self.proxy.behave(Manner::Refuse(status));
+    }
+
+    /// How many requests were refused and connections cut so far.
+    #[allow(dead_code, reason = "not every program that includes this file needs it")]
+    pub fn failures(&self) -> usize {
+        self.proxy.failures.load(Ordering::SeqCst)
     }
 }
 
@@ -96,42 +135,94 @@ impl Drop for Bucket {
     }
 }
 
-async fn pass_on(listener: tokio::net::TcpListener, server: SocketAddr, delay: Arc<AtomicU64>) {
+async fn stand_between(listener: tokio::net::TcpListener, proxy: Arc<Proxy>) {
     while let Ok((client, _)) = listener.accept().await {
-        let delay = delay.clone();
+        let proxy = proxy.clone();
         tokio::spawn(async move {
-            let Ok(server) = tokio::net::TcpStream::connect(server).await else { return };
+            if let Manner::Refuse(status) = proxy.manner() {
+                proxy.refuse(client, status).await;
+                return;
+            }
+            let Ok(server) = tokio::net::TcpStream::connect(proxy.server).await else { return };
             let ((from_client, to_client), (from_server, to_server)) = (client.into_split(), server.into_split());
             tokio::select! {
-                () = copy(from_client, to_server, &delay) => {}
-                () = copy(from_server, to_client, &delay) => {}
+                () = proxy.copy(from_client, to_server, false) => {}
+                () = proxy.copy(from_server, to_client, true) => {}
             }
         });
     }
 }
 
-async fn copy(from: tokio::net::tcp::OwnedReadHalf, to: tokio::net::tcp::OwnedWriteHalf, delay: &AtomicU64) {
-    let mut buffer = vec![0; 1 << 16];
-    while from.readable().await.is_ok() {
-        let read = match from.try_read(&mut buffer) {
-            Ok(0) => return,
-            Ok(read) => read,
-            Err(error) if error.kind() == std::io::ErrorKind::WouldBlock => continue,
-            Err(_) => return,
-        };
-        match delay.load(Ordering::SeqCst) {
-            CUT => return,
-            wait => tokio::time::sleep(Duration::from_millis(wait)).await,
-        }
-        let mut rest = &buffer[..read];
-        while !rest.is_empty() && to.writable().await.is_ok() {
-            match to.try_write(rest) {
-                Ok(written) => rest = &rest[written..],
-                Err(error) if error.kind() == std::io::ErrorKind::WouldBlock => {}
-                Err(_) => return,
+impl Proxy {
+    fn manner(&self) -> Manner {
+        *self.manner.lock().expect("no panic")
+    }
+
+    fn behave(&self, manner: Manner) {
+        *self.manner.lock().expect("no panic") = manner;
+    }
+
+    fn fail(&self) {
+        self.failures.fetch_add(1, Ordering::SeqCst);
+    }
+
+    /// Copies until either side ends or the connection is to be cut.
+    async fn copy(&self, mut from: impl AsyncRead + Unpin, mut to: impl AsyncWrite + Unpin, is_answer: bool) {
+        let (mut buffer, mut passed) = (vec![0; 1 << 16], 0);
+        while let Ok(read @ 1..) = from.read(&mut buffer).await {
+            let kept = match self.manner() {
+                Manner::PassOn(wait) => {
+                    tokio::time::sleep(wait).await;
+                    read
+                }
+                Manner::CutAfter(bytes) if is_answer => read.min(bytes.saturating_sub(passed)),
+                Manner::CutAfter(_) => read,
+                // whoever is in the middle of a request cannot be answered, and comes again
+                Manner::Cut | Manner::Refuse(_) => 0,
+            };
+            passed += kept;
+            let written = to.write_all(&buffer[..kept]).await;
+            if kept < read {
+                self.fail();
+                return;
+            }
+            if written.is_err() {
+                return;
             }
         }
     }
+
+    /// Reads one request and answers it with an error, as a bucket says it.
+    async fn refuse(&self, mut client: tokio::net::TcpStream, status: u16) {
+        let (mut buffer, mut request) = (vec![0; 1 << 16], Vec::new());
+        while !is_whole(&request) {
+            let Ok(read @ 1..) = client.read(&mut buffer).await else { return };
+            request.extend_from_slice(&buffer[..read]);
+        }
+        self.fail();
+        let code = match status {
+            403 => "AccessDenied",
+            503 => "SlowDown",
+            _ => "InternalError",
+        };
+        let error = format!("<Error><Code>{code}</Code><Message>by the test</Message></Error>");
+        let head = format!(
+            "HTTP/1.1 {status} {code}\r\ncontent-type: application/xml\r\ncontent-length: {}\r\nconnection: close\r\n\r\n",
+            error.len(),
+        );
+        let body = if request.starts_with(b"HEAD ") { "" } else { &error };
+        // a client that has gone away misses nothing
+        let _ = client.write_all(format!("{head}{body}").as_bytes()).await;
+        let _ = client.shutdown().await;
+    }
+}
+
+/// Whether a request has come to its end; clients of buckets say how long it is.
+fn is_whole(request: &[u8]) -> bool {
+    let Some(head) = request.windows(4).position(|bytes| bytes == b"\r\n\r\n") else { return false };
+    let text = String::from_utf8_lossy(&request[..head]).to_ascii_lowercase();
+    let length = text.lines().find_map(|line| line.strip_prefix("content-length:")?.trim().parse().ok());
+    request.len() >= head + 4 + length.unwrap_or(0)
 }
 
 fn program() -> Option<PathBuf> {

@@ -30,7 +30,15 @@ impl NatsServer {
     /// # Panics
     /// When it does not start, or when there is none and `CI` is `true`.
     pub fn start() -> Option<Self> {
-        let server = Self::begin(&program()?, Vec::new());
+        let server = Self::begin(&program()?, Vec::new(), None);
+        server.wait();
+        Some(server)
+    }
+
+    /// Starts a server, as [`start`](Self::start) does, that stores so many bytes and no more.
+    #[allow(dead_code, reason = "not every test that includes this file needs it")]
+    pub fn start_with_room(bytes: u64) -> Option<Self> {
+        let server = Self::begin(&program()?, Vec::new(), Some(bytes));
         server.wait();
         Some(server)
     }
@@ -43,18 +51,16 @@ impl NatsServer {
         let servers = [0, 1, 2].map(|i: usize| {
             let cluster = ["--cluster_name", "test", "--cluster", &addresses[i], "--routes", &addresses.join(",")];
             let name = ["--name".to_owned(), format!("n{i}")];
-            Self::begin(&program, cluster.map(str::to_owned).into_iter().chain(name).collect())
+            Self::begin(&program, cluster.map(str::to_owned).into_iter().chain(name).collect(), None)
         });
         servers.iter().for_each(Self::wait);
         Some(servers)
     }
 
-    fn begin(program: &Path, mut arguments: Vec<String>) -> Self {
+    fn begin(program: &Path, mut arguments: Vec<String>, room: Option<u64>) -> Self {
         let (folder, port) = (tempfile::tempdir().expect("folder"), free_port());
+        configure(folder.path(), room);
         let path = |name: &str| folder.path().join(name).display().to_string();
-        let config = SHIPPED.replace("/data/nats", &path("store"));
-        assert_ne!(config, SHIPPED, "the store is not where it was");
-        std::fs::write(path("nats.conf"), config).expect("writes");
         let own = ["--config", &path("nats.conf"), "--addr", "127.0.0.1", "--port", &port.to_string()];
         arguments.extend(own.into_iter().chain(["--log", &path("log")]).map(str::to_owned));
         Self { child: spawn(program, &arguments), program: program.to_owned(), arguments, folder, port }
@@ -70,6 +76,12 @@ impl NatsServer {
     pub fn kill(&mut self) {
         self.child.kill().expect("kills");
         self.child.wait().expect("ends");
+    }
+
+    /// Lets it store so many bytes from its next start on.
+    #[allow(dead_code, reason = "not every test that includes this file needs it")]
+    pub fn give_room(&self, bytes: u64) {
+        configure(self.folder.path(), Some(bytes));
     }
 
     /// Starts it again on the same port with the same store.
@@ -100,6 +112,18 @@ impl Drop for NatsServer {
             eprintln!("the server's log:\n{}", self.log());
         }
     }
+}
+
+/// Writes the configuration that is shipped, with the store in a folder, and with a limit to it if there is to be one.
+fn configure(folder: &Path, room: Option<u64>) {
+    let mut config = SHIPPED.replace("/data/nats", &folder.join("store").display().to_string());
+    assert_ne!(config, SHIPPED, "the store is not where it was");
+    if let Some(bytes) = room {
+        let limited = config.replacen("store_dir:", &format!("max_file_store: {bytes}\n  store_dir:"), 1);
+        assert_ne!(limited, config, "the store is not told as it was");
+        config = limited;
+    }
+    std::fs::write(folder.join("nats.conf"), config).expect("writes");
 }
 
 /// A port that is free now. It is given back at once, so that the server can have it, and have it again after a restart.

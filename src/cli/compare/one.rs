@@ -12,12 +12,14 @@ use crate::field::sampler::Tally;
 use crate::job::failure::{self, Failure};
 use crate::job::pipeline::{self, Asked, Made, Opened};
 use crate::job::spec::{FieldSpec, OutputName};
-use crate::measure::baseline::{Baseline, baseline, side_for};
+use crate::measure::Report;
+use crate::measure::baseline::{Baseline, baseline, cubes_at, side_for};
 use crate::measure::report::passes;
 use crate::measure::truth::Truth;
 use crate::settings::{CancelToken, Canceled, Progress, Settings};
-use crate::shrink::ShrinkSpec;
 use crate::shrink::lattice::LatticeSpec;
+use crate::shrink::{Method, ShrinkSpec};
+use crate::surface::sheet::plain_picture;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::sync::Arc;
@@ -47,6 +49,8 @@ pub struct Task<'a> {
     pub keep: Option<&'a Path>,
     /// Whether pictures are drawn.
     pub draw: bool,
+    /// Whether the paper's method is run, too, and drawn with marching cubes beside the result.
+    pub side_by_side: bool,
     /// The pool.
     pub pool: &'a rayon::ThreadPool,
     /// Raised by the signal.
@@ -63,8 +67,19 @@ pub enum Ended {
     Io(String),
 }
 
-/// Takes a row as it comes, with its picture (empty for none).
-pub type Add<'a> = &'a mut dyn FnMut(Row, Vec<u8>) -> Result<(), String>;
+/// Pictures of a row, each empty where there is none.
+#[derive(Default)]
+pub struct Pictures {
+    /// The result.
+    pub own: Vec<u8>,
+    /// Marching cubes.
+    pub cubes: Vec<u8>,
+    /// What the paper's method made.
+    pub paper: Vec<u8>,
+}
+
+/// Takes a row as it comes, with its pictures.
+pub type Add<'a> = &'a mut dyn FnMut(Row, Pictures) -> Result<(), String>;
 
 /// Wraps a shape on every lattice and hands over each row as it comes.
 pub fn run(shape: &Shape, task: &Task<'_>, add: Add<'_>) -> Result<(), Ended> {
@@ -77,8 +92,14 @@ pub fn run(shape: &Shape, task: &Task<'_>, add: Add<'_>) -> Result<(), Ended> {
     let sampler = Sampler::new(opened.field.as_ref(), settings, &tally);
     let mut beside = Beside::new(&sampler);
     for &lattice in task.lattices {
-        let (row, picture) = wrapped(shape, task, &opened, &watch, lattice, load, &mut beside)?;
-        add(row, picture).map_err(Ended::Io)?;
+        let (mut row, own) = wrapped(shape, task, &opened, &watch, lattice, load, &mut beside)?;
+        let mut pictures = Pictures { own, ..Pictures::default() };
+        if task.side_by_side {
+            let vertices = row.report.as_ref().map_or(lattice.vertices(), |report| report.vertices);
+            pictures.cubes = beside.picture(vertices).map_err(|Canceled| Ended::Stopped)?;
+            (row.paper, pictures.paper) = by_the_paper(task, &opened, lattice)?;
+        }
+        add(row, pictures).map_err(Ended::Io)?;
     }
     Ok(())
 }
@@ -125,6 +146,37 @@ impl<'s, 'a> Beside<'s, 'a> {
         self.known.push((side, found));
         Ok(found)
     }
+
+    /// Its picture; empty where there is nothing.
+    fn picture(&mut self, vertices: u64) -> Result<Vec<u8>, Canceled> {
+        self.get(vertices)?;
+        let Some(truth) = &self.truth else { return Ok(Vec::new()) };
+        let Some(side) = side_for(truth, vertices) else { return Ok(Vec::new()) };
+        match cubes_at(truth, side)? {
+            Some(cubes) => plain_picture(&cubes.vertices, &cubes.triangles, self.sampler.settings()),
+            None => Ok(Vec::new()),
+        }
+    }
+}
+
+/// What the paper's method makes of the same field on the same lattice, and its picture.
+fn by_the_paper(task: &Task<'_>, opened: &Opened, lattice: LatticeSpec) -> Result<(Option<Report>, Vec<u8>), Ended> {
+    let spec = ShrinkSpec { lattice, method: Method::Paper, ..ShrinkSpec::default() };
+    let asked = Asked { shrink: &spec, budget: task.budget, outputs: &[OutputName::Glb], load_seconds: 0.0 };
+    let made = guarded(task, &|cancel| {
+        let settings = Settings { pool: task.pool, cancel, progress: &|_| {}, watched: false };
+        pipeline::make(opened, &asked, settings)
+    });
+    let settings = Settings { pool: task.pool, cancel: task.stop, progress: &|_| {}, watched: false };
+    match made {
+        Guarded::Done(Ok(made)) => {
+            let picture = sheet::picture(&made, lattice, &settings).map_err(|Canceled| Ended::Stopped)?;
+            Ok((Some(made.report), picture))
+        }
+        Guarded::Done(Err(failure::Ended::Canceled)) if task.stop.is_canceled() => Err(Ended::Stopped),
+        // a shape that it makes nothing of
+        _ => Ok((None, Vec::new())),
+    }
 }
 
 fn wrapped(
@@ -160,6 +212,7 @@ fn wrapped(
         attempts: None,
         report: None,
         baseline: None,
+        paper: None,
     };
     let mut picture = Vec::new();
     let expected = task.expected.iter().any(|pattern| fits(pattern, &shape.name));
@@ -270,6 +323,7 @@ mod tests {
             expected: &[],
             keep: None,
             draw: false,
+            side_by_side: false,
             pool: &pool,
             stop: &stop,
         };

@@ -63,6 +63,9 @@ pub struct Row {
     pub report: Option<Report>,
     /// Marching cubes of as many vertices on the same field.
     pub baseline: Option<Baseline>,
+    /// The report of what the paper's method made of it, where it was asked for and made something.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub paper: Option<Report>,
 }
 
 impl Row {
@@ -199,6 +202,7 @@ mod tests {
             attempts: None,
             report: None,
             baseline: None,
+            paper: None,
         };
         let cells = |line: &str| line.replace("\\|", "").matches('|').count() - 1;
         for line in head(&Map::new()).lines().filter(|l| l.starts_with('|')) {

@@ -201,6 +201,7 @@ mod tests {
             attempts: None,
             report: None,
             baseline: None,
+            paper: None,
         }
     }
 

@@ -104,6 +104,11 @@ impl Layout {
         self.subject("key", tenant, hash)
     }
 
+    /// What is stored to see whether something can be; no key has its name.
+    pub(super) fn probe(&self) -> String {
+        self.subject("key", &Tenant::default(), "probe")
+    }
+
     /// The job that a subject belongs to.
     pub(super) fn name_of(subject: &str) -> Option<Name> {
         let tokens: Vec<&str> = subject.split('.').collect();

@@ -154,12 +154,21 @@ const MIGRATIONS: [&str; 6] = [
 ",
 ];
 
-/// Brings the file to this version.
-pub(in crate::engine) fn migrate(connection: &mut Connection) -> Result<(), EngineError> {
+/// The file's version.
+///
+/// # Errors
+/// When it is newer than this program's.
+pub(in crate::engine) fn check(connection: &Connection) -> Result<usize, EngineError> {
     let version: usize = connection.query_row("PRAGMA user_version", [], |row| row.get(0))?;
     if version > MIGRATIONS.len() {
         return Err(EngineError::Store(format!("the database is of version {version}, newer than this program")));
     }
+    Ok(version)
+}
+
+/// Brings the file to this version.
+pub(in crate::engine) fn migrate(connection: &mut Connection) -> Result<(), EngineError> {
+    let version = check(connection)?;
     for (i, step) in MIGRATIONS.iter().enumerate().skip(version) {
         let tx = connection.transaction()?;
         tx.execute_batch(step)?;

@@ -52,7 +52,7 @@ impl Film {
             }
         }
         let ball = ball_around(&fronts, surface);
-        let camera_for: Vec<Vec3> = ball.positions.iter().map(|&p| Vec3::from(p)).collect();
+        let camera_for = with_margin(&ball);
         fronts.insert(0, ball);
         let chosen = evenly(&fronts.iter().map(size).collect::<Vec<_>>());
         let drawn: Vec<Drawn> = chosen.into_iter().map(|i| Drawn::new(&fronts[i])).collect();
@@ -107,6 +107,14 @@ fn places_from(known: &Front, front: &Front, settings: &Settings<'_>) -> Result<
         mean.normalize_or(DVec3::Z).as_vec3().to_array()
     };
     Ok(nearest.iter().map(place).collect())
+}
+
+/// What the camera looks at: the largest front, and room for its shadow.
+fn with_margin(largest: &Front) -> Vec<Vec3> {
+    const ROOM: f32 = 1.15;
+    let positions = largest.positions.iter().map(|&p| Vec3::from(p));
+    let center = positions.clone().sum::<Vec3>() / largest.positions.len().max(1) as f32;
+    positions.map(|p| center + ROOM * (p - center)).collect()
 }
 
 /// The sphere around all fronts, on the lattice.

@@ -8,8 +8,9 @@
 use super::super::energy::{Objective, tangents};
 use super::level::Level;
 use super::system::{System, Triangle};
-use crate::settings::{Canceled, Settings};
+use crate::settings::{Canceled, Progress, Settings};
 use glam::{DVec2, DVec3};
+use std::f64::consts::PI;
 
 /// When to stop a descent.
 #[derive(Clone, Copy, Debug)]
@@ -74,6 +75,12 @@ pub fn descend(
         // a step may leave single triangles nearly flat, and only vertex steps see them
         let notable = NOTABLE * energy / level.len() as f64;
         descent.energy -= level.sweep(places, objective, notable, settings)?;
+        (settings.progress)(Progress {
+            stage: "map",
+            iteration: descent.steps as u32,
+            energy: Some(descent.energy / (4.0 * PI)),
+            ..Progress::default()
+        });
     }
     Ok(descent)
 }

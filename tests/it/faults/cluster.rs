@@ -1,12 +1,13 @@
 //! Nodes and servers of a cluster that die or freeze, as processes.
 
+use super::lengthy;
 use crate::app::{App, PATIENCE, small, state};
 use crate::cluster::nats_server::NatsServer;
 use crate::walk::{follow, frames};
 use eventsource_stream::Eventsource;
 use futures::StreamExt;
 use reqwest::{Method, StatusCode};
-use serde_json::{Value, json};
+use serde_json::Value;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -15,7 +16,8 @@ use std::time::{Duration, Instant};
 /// Longer than an election takes on a slow machine.
 const LEASE: (&str, &str) = ("SHRINKD_WORKER__LEASE_S", "10");
 
-fn node(folder: &Path, engine: &str, more: &[(&str, &str)]) -> App {
+/// A node of the cluster whose servers are at an address.
+pub(super) fn node(folder: &Path, engine: &str, more: &[(&str, &str)]) -> App {
     App::start_with(folder, &[&[("SHRINKD_ENGINE", engine)], more].concat())
 }
 
@@ -23,14 +25,6 @@ fn node(folder: &Path, engine: &str, more: &[(&str, &str)]) -> App {
 fn of_three(servers: &[NatsServer; 3]) -> String {
     let hosts = servers.each_ref().map(|server| server.url().trim_start_matches("nats://").to_owned()).join(",");
     format!("nats://{hosts}?replicas=3")
-}
-
-/// Long enough to be met in the middle, short enough to be waited for.
-fn lengthy() -> Value {
-    json!({
-        "field": {"scene": {"ellipsoid": {"radii": [0.7, 0.5, 0.4]}}},
-        "shrink": {"method": "paper", "lattice": {"latlong": {"n_theta": 200, "n_phi": 100}}},
-    })
 }
 
 /// Submits until it is answered, on one node after the other, as a client with a key does.
@@ -67,7 +61,7 @@ async fn get_under(app: &App, path: &str) -> reqwest::Response {
 }
 
 /// Checks that a job ended well and once: its events are numbered from 1 without a gap, and only the last one is its end.
-async fn ended_once(app: &App, id: &str) -> Value {
+pub(super) async fn ended_once(app: &App, id: &str) -> Value {
     let clock = Instant::now();
     let job = loop {
         let job: Value = get_under(app, &format!("/v1/jobs/{id}")).await.json().await.expect("JSON");
