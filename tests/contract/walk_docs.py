@@ -235,7 +235,7 @@ def walk(page, program, timeout):
                     print("--- the service said:\n" + COLOURS.sub("", served.read_text(errors="replace"))[-TAIL:].rstrip() + "\n---")
                 left = len(blocks) - index - 1
                 if left:
-                    print(f"the {left} blocks that follow in {page} were not run", flush=True)
+                    print(f"not run of {page}: {left} more", flush=True)
                 break
         finally:
             session.close()
