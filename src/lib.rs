@@ -103,7 +103,7 @@
 //!
 //! **Faces.** They translate, and never compute.
 //!
-//! - [`http`](crate::http) and [`grpc`]: the same service on one port.
+//! - [HTTP](crate::http) and [gRPC](crate::grpc): the same service on one port.
 //! - [`cli`]: a file per command; its `serve` puts the rooms together.
 //! - [`config`], [`telemetry`]: settings, the log, metrics and traces.
 //!
