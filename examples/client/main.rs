@@ -6,6 +6,7 @@
 //!
 //! `SHRINKD_KEY` is the API key, where the service asks for one.
 
+#[allow(dead_code, reason = "this example needs a part of it")]
 mod shrinkd;
 
 use futures::StreamExt;

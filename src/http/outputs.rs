@@ -83,9 +83,11 @@ pub async fn download(
     set(header::CONTENT_DISPOSITION, &format!("inline; filename=\"{id}.{}\"", kind.extension()))?;
     // a browser must not guess that an output is a page
     set(header::X_CONTENT_TYPE_OPTIONS, "nosniff")?;
-    // a link is signed for GET
+    // a link is signed for GET, and the page of this service may not read from elsewhere
+    let from_page = headers.get("sec-fetch-site").is_some_and(|site| site == "same-origin");
     if !app.download_link.is_zero()
         && method == Method::GET
+        && !from_page
         && let Some(link) = app.blobs.signed_link(blob, app.download_link).await?
     {
         // the link dies before its answer may be reused

@@ -53,6 +53,9 @@ async fn blobs_in_a_bucket_are_served_whole_in_ranges_and_by_links() {
     assert_eq!(answer.headers()["cache-control"], "no-store");
     let linked = reqwest::get(&link).await.expect("an answer").bytes().await.expect("bytes");
     assert_eq!(linked, whole);
+    // the page may not read from elsewhere
+    let page = strict.get(format!("{}{path}", app.url)).header("sec-fetch-site", "same-origin").send().await;
+    assert_eq!(page.expect("an answer").status(), StatusCode::OK);
     // a link is good for GET alone
     let head = strict.head(format!("{}{path}", app.url)).send().await.expect("an answer");
     assert_eq!(
