@@ -14,11 +14,11 @@ use tower::ServiceExt;
 pub async fn run(router: Router, address: SocketAddr, field: PathBuf) {
     match submit(&router, &field).await {
         Ok(job) if job["state"] == "succeeded" => {
-            let at =
-                |name: &str| format!("http://{address}/v1/jobs/{}/outputs/{name}", job["id"].as_str().unwrap_or(""));
+            let id = job["id"].as_str().unwrap_or("");
+            let at = |name: &str| format!("http://{address}/v1/jobs/{id}/outputs/{name}");
             tracing::info!(
                 field = %field.display(), glb = at("glb"), preview = at("preview"), report = at("report"),
-                "the first job succeeded; open http://{address}/ to see it"
+                "the first job succeeded; open http://{address}/#/jobs/{id} to see it"
             );
         }
         Ok(job) => tracing::error!(field = %field.display(), answer = %job, "the first job did not succeed"),
@@ -34,6 +34,7 @@ async fn submit(router: &Router, field: &PathBuf) -> Result<Value, Box<dyn std::
     }
     let body = json!({"field": {"input": input["id"]}}).to_string();
     let mut job = ask(router, Method::POST, "/v1/jobs", "application/json", body.into()).await?;
+    tracing::info!(field = %field.display(), job.id = job["id"].as_str(), "the first job is being made");
     while let (Some(id), Some("queued" | "running" | "canceling")) = (job["id"].as_str(), job["state"].as_str()) {
         job = ask(router, Method::GET, &format!("/v1/jobs/{id}?wait=30"), "", Body::empty()).await?;
     }

@@ -18,6 +18,7 @@ use crate::telemetry;
 use crate::telemetry::metrics::{self, Exposition};
 use crate::telemetry::traces::Traces;
 use serde::Serialize;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -122,6 +123,10 @@ async fn open_authenticator(
     Ok(Some(Arc::new(Authenticator { keys, issuer })))
 }
 
+async fn listen(address: SocketAddr) -> Result<TcpListener, String> {
+    TcpListener::bind(address).await.map_err(|e| format!("{address} cannot be listened at: {e}"))
+}
+
 async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std::error::Error>> {
     for warning in config.warnings() {
         tracing::warn!("{warning}");
@@ -138,7 +143,7 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
     let authenticator = open_authenticator(&config, &stop).await?;
     let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
 
-    let listener = TcpListener::bind(config.listen).await?;
+    let listener = listen(config.listen).await?;
     let address = listener.local_addr()?;
     if config.role != Role::Api {
         metrics::worker_started(config.worker.slots, pool.current_num_threads());
@@ -177,7 +182,7 @@ async fn serve(config: Config, first: Option<PathBuf>) -> Result<(), Box<dyn std
         stop: stop.clone(),
     };
     if let Some(address) = config.metrics_listen {
-        let (listener, router) = (TcpListener::bind(address).await?, http::metrics::router(app.clone()));
+        let (listener, router) = (listen(address).await?, http::metrics::router(app.clone()));
         tracing::info!(http.address = %listener.local_addr()?, "serving metrics");
         tokio::spawn(http::server::serve(listener, router, close.clone()));
     }

@@ -54,8 +54,6 @@ pub fn certify(surface: &Surface, sampler: &Sampler<'_>) -> Result<Certificate, 
     let vertices = positions(surface);
     let (folded, degenerate) = surface_flips(&vertices, &surface.triangles, sampler)?;
     let crossing = self_intersections(&vertices, &surface.triangles, sampler.settings())?;
-    let mut crossed: Vec<u32> = crossing.iter().map(|pair| pair.0).collect();
-    crossed.dedup();
     let places = |list: &[u32]| -> Vec<DVec3> {
         let centroid = |&t: &u32| corners(&vertices, surface.triangles[t as usize]).iter().sum::<DVec3>() / 3.0;
         list.iter().take(PLACES).map(centroid).collect()
@@ -66,8 +64,8 @@ pub fn certify(surface: &Surface, sampler: &Sampler<'_>) -> Result<Certificate, 
         flips: Flips { surface: folded.len() as u64, sphere: sphere_flips(surface), uv: uv_flips(surface) },
         flip_places: places(&folded),
         degenerate,
-        self_intersections: crossing.len() as u64,
-        intersection_places: places(&crossed),
+        self_intersections: crossing.pairs,
+        intersection_places: places(&crossing.triangles),
     })
 }
 
@@ -155,12 +153,13 @@ pub fn crossings(
     triangles: &[[u32; 3]],
     settings: &Settings<'_>,
 ) -> Result<(u64, Vec<DVec3>), Canceled> {
-    let pairs = self_intersections(vertices, triangles, settings)?;
-    let mut first: Vec<u32> = pairs.iter().map(|p| p.0).collect();
-    first.dedup();
-    let places =
-        first.iter().take(PLACES).map(|&t| corners(vertices, triangles[t as usize]).iter().sum::<DVec3>() / 3.0);
-    Ok((pairs.len() as u64, places.collect()))
+    let crossing = self_intersections(vertices, triangles, settings)?;
+    let places = crossing
+        .triangles
+        .iter()
+        .take(PLACES)
+        .map(|&t| corners(vertices, triangles[t as usize]).iter().sum::<DVec3>() / 3.0);
+    Ok((crossing.pairs, places.collect()))
 }
 
 #[cfg(test)]

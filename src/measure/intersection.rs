@@ -6,8 +6,16 @@ use super::{corners, map_chunks};
 use crate::settings::{Canceled, Settings};
 use glam::{DVec2, DVec3};
 
-/// Every pair `(i, j)`, `i < j`, of triangles of a mesh that meet in more than the vertices or the edge they share, in
-/// ascending order:
+/// Triangles of a mesh that meet others. A surface that is folded all over has hundreds of millions of pairs: they are counted, not kept.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Crossing {
+    /// Pairs.
+    pub pairs: u64,
+    /// The triangles that meet one that comes after them, in ascending order.
+    pub triangles: Vec<u32>,
+}
+
+/// The pairs of triangles of a mesh that meet in more than the vertices or the edge they share:
 ///
 /// - no vertex shared: the closed triangles have a point in common (touching counts);
 /// - one vertex shared: they have another point in common;
@@ -23,21 +31,21 @@ pub fn self_intersections(
     vertices: &[DVec3],
     triangles: &[[u32; 3]],
     settings: &Settings<'_>,
-) -> Result<Vec<(u32, u32)>, Canceled> {
+) -> Result<Crossing, Canceled> {
     let boxes: Vec<Aabb> = triangles.iter().map(|&t| Aabb::of(&corners(vertices, t))).collect();
     let tree = Bvh::new(&boxes);
     let found = map_chunks(triangles, settings, |i, &t| {
-        let mut hits: Vec<(u32, u32)> = Vec::new();
+        let mut met = 0u32;
         tree.overlapping(&boxes[i], |j| {
             let later = j as usize > i;
-            if later && boxes[i].overlaps(&boxes[j as usize]) && pair_meets(vertices, t, triangles[j as usize]) {
-                hits.push((i as u32, j));
-            }
+            let meets =
+                later && boxes[i].overlaps(&boxes[j as usize]) && pair_meets(vertices, t, triangles[j as usize]);
+            met += u32::from(meets);
         });
-        hits.sort_unstable();
-        hits
+        met
     })?;
-    Ok(found.into_iter().flatten().collect())
+    let triangles = (0u32..).zip(&found).filter(|(_, met)| **met > 0).map(|(i, _)| i).collect();
+    Ok(Crossing { pairs: found.iter().copied().map(u64::from).sum(), triangles })
 }
 
 /// Whether two triangles of a mesh meet in more than what they share; see [`self_intersections`].
@@ -219,21 +227,22 @@ mod tests {
         with_settings(2, |settings| {
             let (mut vertices, mut triangles) = sphere_mesh(32, 16, 1.0, DVec3::ZERO);
             let single: Vec<DVec3> = vertices.iter().map(|p| p.as_vec3().as_dvec3()).collect();
-            assert_eq!(self_intersections(&single, &triangles, settings).unwrap(), []);
+            assert_eq!(self_intersections(&single, &triangles, settings).unwrap(), Crossing::default());
             let (more, faces) = sphere_mesh(32, 16, 1.0, v(0.7, 0.0, 0.0));
             let offset = vertices.len() as u32;
             vertices.extend(more);
             triangles.extend(faces.iter().map(|t| t.map(|v| v + offset)));
-            let pairs = self_intersections(&vertices, &triangles, settings).unwrap();
-            assert!(pairs.len() > 30, "{}", pairs.len());
-            let split = triangles.len() as u32 / 2;
-            assert!(pairs.iter().all(|&(i, j)| i < split && j >= split));
+            let found = self_intersections(&vertices, &triangles, settings).unwrap();
+            assert!(found.pairs > 30, "{found:?}");
             // the search over all pairs finds the same
-            let all = (0..triangles.len())
-                .flat_map(|i| (i + 1..triangles.len()).map(move |j| (i, j)))
-                .filter(|&(i, j)| pair_meets(&vertices, triangles[i], triangles[j]))
-                .count();
-            assert_eq!(all, pairs.len());
+            let mut all: Vec<(usize, usize)> =
+                (0..triangles.len()).flat_map(|i| (i + 1..triangles.len()).map(move |j| (i, j))).collect();
+            all.retain(|&(i, j)| pair_meets(&vertices, triangles[i], triangles[j]));
+            let split = triangles.len() / 2;
+            assert!(all.iter().all(|&(i, j)| i < split && j >= split));
+            let mut first: Vec<u32> = all.iter().map(|&(i, _)| i as u32).collect();
+            first.dedup();
+            assert_eq!(found, Crossing { pairs: all.len() as u64, triangles: first });
         });
     }
 }
