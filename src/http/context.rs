@@ -46,7 +46,7 @@ pub async fn request(mut request: Request, next: Next) -> Response {
         }
         let elapsed = clock.elapsed();
         metrics::request_answered(&method, &route, status.as_u16(), elapsed);
-        let elapsed_ms = elapsed.as_secs_f64() * 1e3;
+        let elapsed_ms = (elapsed.as_secs_f64() * 1e6).round() / 1e3;
         tracing::info!(http.status = status.as_u16(), elapsed_ms, "request answered");
         response
     }
