@@ -48,6 +48,12 @@ async fn a_running_service_tells_what_is_documented_and_nothing_else() {
     let glb = app.get(&format!("/v1/jobs/{id}/outputs/glb")).await.bytes().await.expect("bytes");
     assert_eq!(app.get("/v1/nothing").await.status(), StatusCode::NOT_FOUND);
 
+    // the worker counts an attempt once its end is stored, which is when readers hear of it
+    let ran = r#"shrinkd_job_run_duration_seconds_count{kind="shrink",outcome="succeeded"}"#;
+    crate::tenants::eventually("the attempt is counted", async || {
+        samples(&app.get("/metrics").await.text().await.expect("text")).get(ran) == Some(&1.0)
+    })
+    .await;
     let text = app.get("/metrics").await.text().await.expect("text");
     assert_eq!(described(&text), documented());
     let told = samples(&text);
