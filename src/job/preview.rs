@@ -129,14 +129,23 @@ fn coarsened(front: &Front) -> Option<Front> {
             continue;
         }
         let corners = front.triangles.iter().map(|t| t.map(|v| merged[v as usize]));
-        return Some(Front {
-            positions: sums.iter().map(|&(sum, count)| (sum / count as f32).to_array()).collect(),
-            triangles: corners.filter(|[a, b, c]| a != b && b != c && c != a).collect(),
-            places: match front.places.is_empty() {
-                true => Vec::new(),
-                false => places.iter().map(|d| d.normalize_or(Vec3::Z).to_array()).collect(),
-            },
-        });
+        let mut triangles: Vec<[u32; 3]> = corners.filter(|[a, b, c]| a != b && b != c && c != a).collect();
+        // what has lost all its triangles is left out, too
+        let mut left = vec![u32::MAX; sums.len()];
+        let mut coarse = Front::default();
+        for corner in triangles.iter_mut().flatten() {
+            let vertex = *corner as usize;
+            if left[vertex] == u32::MAX {
+                left[vertex] = coarse.positions.len() as u32;
+                let (sum, count) = sums[vertex];
+                coarse.positions.push((sum / count as f32).to_array());
+                if !front.places.is_empty() {
+                    coarse.places.push(places[vertex].normalize_or(Vec3::Z).to_array());
+                }
+            }
+            *corner = left[vertex];
+        }
+        return Some(Front { triangles, ..coarse });
     }
 }
 
@@ -183,7 +192,8 @@ mod tests {
         assert!(
             coarse.places.len() == coarse.positions.len() && coarse.positions.iter().zip(&coarse.places).all(beside)
         );
-        assert!(coarse.triangles.iter().flatten().all(|&v| (v as usize) < coarse.positions.len()));
+        let used: std::collections::BTreeSet<u32> = coarse.triangles.iter().flatten().copied().collect();
+        assert!(used.iter().copied().eq(0..coarse.positions.len() as u32), "every vertex has a triangle");
         let volume: f32 = coarse
             .triangles
             .iter()
