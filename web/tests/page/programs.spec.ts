@@ -13,7 +13,10 @@ const INTERPRETERS = { curl: ["sh", "-c"], Python: ["python3", "-c"] } as const;
 /** The program as it is shown, run in an empty folder; gives the first bytes of the file it made. */
 async function result(page: Page, language: keyof typeof INTERPRETERS, made: string, needs?: string): Promise<string> {
   await page.locator(".job-form").getByRole("radio", { name: language }).check({ force: true });
-  const program = await page.locator(".job-form .code-text").textContent();
+  // the panel is written after it has opened, and again after every choice
+  const text = page.locator(".job-form .code-text");
+  await expect(text).toContainText(language === "curl" ? `-o ${made}` : `open("${made}"`);
+  const program = await text.textContent();
   const folder = mkdtempSync(join(tmpdir(), "shrinkd-program-"));
   try {
     if (needs) copyFileSync(needs, join(folder, "blob.safetensors"));
