@@ -6,6 +6,7 @@
 pub mod animate;
 pub mod compare;
 mod completions;
+mod describe;
 mod doctor;
 pub mod evaluate;
 pub mod extract;
@@ -22,6 +23,7 @@ pub mod serve;
 use crate::config::Role;
 use crate::field::Domain;
 use crate::field::input::{DomainName, DomainOption, FieldOptions};
+use crate::job::failure::Failure;
 use crate::measure::chart::SphereChart;
 use crate::shrink::lattice::LatticeSpec;
 use clap::{Args, Parser, Subcommand, ValueEnum};
@@ -60,6 +62,9 @@ enum Command {
     /// self-intersections, nowhere farther than 1 % of the diagonal from the zero level set)
     #[command(after_long_help = EXTRACT_EXAMPLES)]
     Extract(ExtractArgs),
+    /// Say what a file is taken for, and what was found in it, without wrapping it
+    #[command(after_long_help = describe::EXAMPLES)]
+    Describe(describe::DescribeArgs),
     /// Wrap a network along a path through its latent space: one GLB with a morph target for every frame and one set of UVs
     #[command(after_long_help = ANIMATE_EXAMPLES)]
     Animate(AnimateArgs),
@@ -300,6 +305,15 @@ fn read_field(path: &Path) -> std::io::Result<Vec<u8>> {
     if path.is_dir() { crate::field::network::folder::pack(path) } else { std::fs::read(path) }
 }
 
+/// What is wrong with an input: its faults a line each where they have places in it, or a sentence.
+fn faults(failure: &Failure) -> String {
+    if failure.errors.is_empty() {
+        return failure.detail.clone();
+    }
+    let lines: String = failure.errors.iter().map(|fault| format!("\n  {}: {}", fault.pointer, fault.detail)).collect();
+    format!("{}{lines}", failure.title)
+}
+
 impl FieldArgs {
     /// What they say of a field, the latent code read from its file.
     ///
@@ -452,6 +466,7 @@ pub fn run() -> ExitCode {
     match Cli::parse().command {
         Command::Serve(args) => serve::run(&args),
         Command::Extract(args) => extract::run(&args),
+        Command::Describe(args) => describe::run(&args),
         Command::Animate(args) => animate::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Compare(args) => compare::run(&args),

@@ -86,6 +86,7 @@ fn api() -> OpenApiRouter<App> {
         .routes(routes!(jobs::submit, list::list))
         .routes(routes!(jobs::get, jobs::forget))
         .routes(routes!(jobs::cancel))
+        .routes(routes!(jobs::request::show))
         .routes(routes!(jobs::sensitivity::differentiate))
         .routes(routes!(events::events))
         .routes(routes!(outputs::download))

@@ -126,10 +126,7 @@ fn extract(args: &ExtractArgs) -> Result<(), (u8, String)> {
 /// Reads a file and opens it; what is wrong is said with the file's name.
 fn open(path: &Path, with: impl FnOnce(&[u8]) -> Result<Opened, Box<Failure>>) -> Result<Opened, (u8, String)> {
     let bytes = super::read_field(path).map_err(|e| (BAD_INPUT, format!("{}: {e}", path.display())))?;
-    with(&bytes).map_err(|failure| {
-        let places: String = failure.errors.iter().map(|e| format!("\n  {}: {}", e.pointer, e.detail)).collect();
-        (BAD_INPUT, format!("{}: {}{places}", path.display(), failure.detail))
-    })
+    with(&bytes).map_err(|failure| (BAD_INPUT, format!("{}: {}", path.display(), super::faults(&failure))))
 }
 
 /// A finding in one line: its sentence, its code, and where.
@@ -164,8 +161,9 @@ fn name(path: &Path) -> std::borrow::Cow<'_, str> {
 fn summary(args: &ExtractArgs, made: &Made, seconds: f64) -> String {
     let report = &made.report;
     let flips = report.flips.surface + report.flips.sphere + report.flips.uv;
+    let passed = if report.verdict.passed { "; passed every check" } else { "" };
     format!(
-        "{} -> {}: {} vertices, {:.1} evaluations per vertex, {flips} flips, NC {:.4}, max distance {:.2} %, {seconds:.2} s",
+        "{} -> {}: {} vertices, {:.1} evaluations per vertex, {flips} flips, NC {:.4}, max distance {:.2} %, {seconds:.2} s{passed}",
         name(&args.field),
         name(&args.output),
         report.vertices,
@@ -177,8 +175,9 @@ fn summary(args: &ExtractArgs, made: &Made, seconds: f64) -> String {
 
 fn curve_summary(args: &ExtractArgs, svg: &Path, made: &CurveMade, seconds: f64) -> String {
     let report = &made.report;
+    let passed = if made.is_sound() { "; passed every check" } else { "" };
     format!(
-        "{} -> {}, {}: {} samples, {:.1} evaluations per sample, {} self-intersections, max distance {:.2} %, {seconds:.2} s",
+        "{} -> {}, {}: {} samples, {:.1} evaluations per sample, {} self-intersections, max distance {:.2} %, {seconds:.2} s{passed}",
         name(&args.field),
         name(&args.output),
         name(svg),

@@ -4,6 +4,7 @@ use crate::auth::Caller;
 use axum::Router;
 use axum::body::Body;
 use axum::http::{Method, Request, header};
+use futures::TryStreamExt;
 use serde_json::{Value, json};
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -33,12 +34,25 @@ async fn submit(router: &Router, field: &PathBuf) -> Result<Value, Box<dyn std::
         return Ok(input);
     }
     let body = json!({"field": {"input": input["id"]}}).to_string();
-    let mut job = ask(router, Method::POST, "/v1/jobs", "application/json", body.into()).await?;
-    tracing::info!(field = %field.display(), job.id = job["id"].as_str(), "the first job is being made");
-    while let (Some(id), Some("queued" | "running" | "canceling")) = (job["id"].as_str(), job["state"].as_str()) {
-        job = ask(router, Method::GET, &format!("/v1/jobs/{id}?wait=30"), "", Body::empty()).await?;
+    let job = ask(router, Method::POST, "/v1/jobs", "application/json", body.into()).await?;
+    let Some(id) = job["id"].as_str() else { return Ok(job) };
+    tracing::info!(field = %field.display(), job.id = id, "the first job is being made");
+    // its events end when it has ended, or the service stops
+    let events = request(Method::GET, &format!("/v1/jobs/{id}/events"), "", Body::empty())?;
+    let mut events = router.clone().oneshot(events).await?.into_body().into_data_stream();
+    while events.try_next().await?.is_some() {}
+    ask(router, Method::GET, &format!("/v1/jobs/{id}"), "", Body::empty()).await
+}
+
+/// A request from within, where nobody has to say who asks.
+fn request(method: Method, path: &str, media_type: &str, body: Body) -> Result<Request<Body>, axum::http::Error> {
+    let mut request = Request::builder().method(method).uri(path);
+    if !media_type.is_empty() {
+        request = request.header(header::CONTENT_TYPE, media_type);
     }
-    Ok(job)
+    let mut request = request.body(body)?;
+    request.extensions_mut().insert(Caller::anybody());
+    Ok(request)
 }
 
 async fn ask(
@@ -48,14 +62,7 @@ async fn ask(
     media_type: &str,
     body: Body,
 ) -> Result<Value, Box<dyn std::error::Error + Send + Sync>> {
-    let mut request = Request::builder().method(method).uri(path);
-    if !media_type.is_empty() {
-        request = request.header(header::CONTENT_TYPE, media_type);
-    }
-    // from within, where nobody has to say who asks
-    let mut request = request.body(body)?;
-    request.extensions_mut().insert(Caller::anybody());
-    let answer = router.clone().oneshot(request).await?;
+    let answer = router.clone().oneshot(request(method, path, media_type, body)?).await?;
     /// A job document with its report is a few kilobytes.
     const LARGEST: usize = 1 << 20;
     Ok(serde_json::from_slice(&axum::body::to_bytes(answer.into_body(), LARGEST).await?)?)

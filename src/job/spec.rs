@@ -323,6 +323,23 @@ impl JobSpec {
         Ok(Self { traceparent, memory_bytes: memory.and_then(|bytes| bytes.as_u64()), ..spec })
     }
 
+    /// The request that a client could send to have the same job again: what only the engine knows is left away. `None` of a
+    /// sensitivity, which is not asked for by a request in JSON.
+    pub fn as_asked(mut self) -> Option<Self> {
+        self.traceparent = None;
+        self.memory_bytes = None;
+        match &mut self.work {
+            Work::Shrink(work) => {
+                if let Some(warm_start) = &mut work.warm_start {
+                    warm_start.surface = None;
+                }
+            }
+            Work::Fit(_) => {}
+            Work::Sensitivity(_) => return None,
+        }
+        Some(self)
+    }
+
     /// Reads a request.
     ///
     /// # Errors

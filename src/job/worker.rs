@@ -393,10 +393,10 @@ impl Worker {
             match self.engine.finish(claim, outcome.clone()).await {
                 Ok(()) => {
                     let (ended, code) = match &outcome {
-                        Outcome::Succeeded { .. } => ("succeeded", ""),
-                        Outcome::Failed { problem, .. } => ("failed", problem.code.as_str()),
-                        Outcome::Canceled => ("canceled", ""),
-                        Outcome::Released => ("released", ""),
+                        Outcome::Succeeded { .. } => ("succeeded", None),
+                        Outcome::Failed { problem, .. } => ("failed", Some(problem.code.as_str())),
+                        Outcome::Canceled => ("canceled", None),
+                        Outcome::Released => ("released", None),
                     };
                     if let Outcome::Succeeded { metrics, .. } | Outcome::Failed { metrics: Some(metrics), .. } =
                         &outcome

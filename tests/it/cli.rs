@@ -29,6 +29,7 @@ fn extract_writes_every_file_it_was_asked_for_and_one_line() {
     let said = String::from_utf8_lossy(&output.stdout);
     assert_eq!(said.lines().count(), 1, "{said}");
     assert!(said.contains("482 vertices") && said.contains("0 flips"), "{said}");
+    assert!(said.trim_end().ends_with("; passed every check"), "{said}");
     assert_eq!(stderr(&output), "", "no progress bar where there is no terminal");
     assert!(std::fs::read(path("out.glb")).expect("reads").starts_with(b"glTF"));
     assert!(std::fs::read(&preview).expect("reads").starts_with(b"\x89PNG"));
@@ -61,6 +62,103 @@ fn exit_codes_tell_usage_from_input_from_shape() {
     let missing =
         Command::new(BINARY).args(["extract", "/nowhere/x.json", "-o", "/nowhere/y.glb"]).output().expect("runs");
     assert_eq!(missing.status.code(), Some(3));
+}
+
+#[test]
+fn every_fault_of_a_scene_is_told_once() {
+    let folder = tempfile::tempdir().expect("folder");
+    let output = extract(folder.path(), r#"{"union": [{"sphere": {"radios": 1}}, {"box": {}}]}"#, &[]);
+    let said = stderr(&output);
+    let of = |pointer: &str| said.lines().filter(|line| line.contains(pointer)).count();
+    assert_eq!((of("/union/0/sphere"), of("/union/1/box")), (said.matches("/union/0").count(), 1), "{said}");
+    assert!(said.lines().next().is_some_and(|line| line.ends_with("the field's description is invalid")), "{said}");
+}
+
+#[test]
+fn describe_says_what_a_file_is_taken_for() {
+    let describe = |arguments: &[&str]| {
+        let output = Command::new(BINARY).arg("describe").args(arguments).output().expect("runs");
+        (output.status.code(), String::from_utf8_lossy(&output.stdout).into_owned(), stderr(&output))
+    };
+    let fixtures = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures/networks");
+    let (code, said, _) = describe(&[&format!("{fixtures}/morph.safetensors")]);
+    let network: Value = serde_json::from_str(&said).expect("JSON");
+    assert_eq!((code, &network["kind"], &network["latent_rows"]), (Some(0), &"network".into(), &5.into()), "{said}");
+    // what a file cannot be is said as `extract` and the service say it
+    let folder = tempfile::tempdir().expect("folder");
+    let file = folder.path().join("noise.ply");
+    std::fs::write(&file, "no mesh at all").expect("writes");
+    let (code, said, refused) = describe(&[file.to_str().expect("text")]);
+    assert_eq!((code, said.as_str()), (Some(3), ""), "{refused}");
+    assert!(refused.contains("noise.ply"), "{refused}");
+    assert_eq!(describe(&[&format!("{fixtures}/blob.npz"), "--field-options", "{"]).0, Some(2));
+}
+
+#[test]
+fn doctor_says_what_is_wrong_with_a_set_up_and_exits_with_it() {
+    let folder = tempfile::tempdir().expect("folder");
+    let doctor = |arguments: &[&str]| {
+        let output = Command::new(BINARY).arg("doctor").args(arguments).output().expect("runs");
+        (output.status.code(), String::from_utf8_lossy(&output.stdout).into_owned(), stderr(&output))
+    };
+    let data = folder.path().join("data");
+    let data = data.to_str().expect("text");
+    let (code, said, _) = doctor(&["--data", data, "--listen", "127.0.0.1:0"]);
+    assert_eq!(code, Some(0), "{said}");
+    assert!(!Path::new(data).exists(), "nothing is left behind");
+
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
+    let listen = taken.local_addr().expect("an address").to_string();
+    let file = folder.path().join("file");
+    std::fs::write(&file, "").expect("writes");
+    let below_a_file = file.join("data");
+    // nothing is served at port 1
+    let (code, said, _) = doctor(&[
+        "--data",
+        below_a_file.to_str().expect("text"),
+        "--listen",
+        &listen,
+        "--engine",
+        "nats://127.0.0.1:1",
+    ]);
+    assert_eq!(code, Some(1), "{said}");
+    let wrong: Vec<&str> = said.lines().filter(|line| line.starts_with("WRONG")).collect();
+    for (what, detail) in [("folder", "is no folder"), ("address", "is taken"), ("engine", "127.0.0.1:1")] {
+        assert!(wrong.iter().any(|line| line.contains(what) && line.contains(detail)), "{what}: {said}");
+    }
+
+    let settings = folder.path().join("shrinkd.toml");
+    std::fs::write(&settings, "[worker]\nslotz = 2\n").expect("writes");
+    let (code, _, refused) = doctor(&["--config", settings.to_str().expect("text")]);
+    assert_eq!(code, Some(2), "{refused}");
+    assert!(refused.contains("slotz"), "{refused}");
+}
+
+#[test]
+fn what_is_piped_has_no_colours_and_no_bars() {
+    let folder = tempfile::tempdir().expect("folder");
+    let out = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
+    let scenes = folder.path().join("scenes");
+    std::fs::create_dir(&scenes).expect("makes");
+    std::fs::write(scenes.join("ball.json"), r#"{"sphere": {"radius": 0.5}}"#).expect("writes");
+    let morph = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures/networks/morph.safetensors");
+    let path = folder.path().join("path.json");
+    std::fs::write(&path, r#"{"from": 0, "to": 1, "frames": 2}"#).expect("writes");
+    let (scenes, path) = (scenes.to_string_lossy(), path.to_string_lossy());
+    let commands: [&[&str]; 5] = [
+        &["--help"],
+        &["extract"],
+        &["extract", morph, "--latent-row", "0", "-o", &out("morph.glb"), "--lattice", SMALL],
+        &["animate", morph, "--latents", &path, "-o", &out("way.glb"), "--lattice", SMALL],
+        &["compare", &scenes, "--lattice", SMALL],
+    ];
+    for command in commands {
+        let output = Command::new(BINARY).args(command).output().expect("runs");
+        for bytes in [&output.stdout, &output.stderr] {
+            let said = String::from_utf8_lossy(bytes);
+            assert!(!said.contains(['\x1b', '\r']), "{command:?}: {said:?}");
+        }
+    }
 }
 
 #[test]

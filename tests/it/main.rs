@@ -1,5 +1,6 @@
 //! Tests of the whole program from outside: the real binary, over HTTP and on the command line.
 
+mod again;
 mod app;
 mod backup;
 mod bucket;

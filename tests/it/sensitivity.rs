@@ -1,6 +1,6 @@
 //! How a surface moves with its network, held against surfaces that were extracted again.
 
-use crate::app::{App, BINARY, endless, state};
+use crate::app::{App, BINARY, endless, problem, state};
 use reqwest::{Method, Response, StatusCode};
 use serde_json::{Value, json};
 use shrinkd::field::network::safetensors as own;
@@ -214,6 +214,8 @@ async fn a_job_is_differentiated_also_when_it_is_forgotten_before() {
     assert_eq!((&accepted["kind"], &accepted["of"]), (&json!("sensitivity"), &json!(id)));
     let forgotten = app.request(Method::DELETE, &format!("/v1/jobs/{id}")).send().await.expect("an answer");
     assert_eq!(forgotten.status(), StatusCode::NO_CONTENT);
+    let request = app.get(&format!("/v1/jobs/{}/request", accepted["id"].as_str().expect("a name"))).await;
+    problem(request, 404, "no_request").await;
     let again = asked(&app, &id, gradient.clone(), "once").await;
     assert_eq!(again.headers()["idempotent-replayed"], "true");
     app.post(&format!("/v1/jobs/{busy}/cancel"), &json!({})).await;

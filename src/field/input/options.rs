@@ -253,7 +253,8 @@ impl FieldOptions {
             Some(row) => row as usize,
             None if size == 0 || rows == 1 => 0,
             None => {
-                let detail = format!("the network takes a latent code of {size} entries, or a row below {rows}");
+                let row = if rows > 0 { format!(", or a row below {rows}") } else { String::new() };
+                let detail = format!("the network takes a latent code of {size} entries{row}");
                 faults.push(fault("/latent", "missing", detail));
                 return Vec::new();
             }

@@ -1,10 +1,8 @@
 //! `/v1/jobs/{id}/sensitivity`: how a loss of a job's surface changes with the network that it came from.
 
 use super::super::rates::Rate;
-use super::{
-    App, Problem, accepted, answer_submit, body, check_memory, idempotency_key, job_id, query, surface_blob,
-    tell_accepted,
-};
+use super::estimate::surface_blob;
+use super::{App, Problem, accepted, answer_submit, body, check_memory, idempotency_key, job_id, query, tell_accepted};
 use crate::auth::{Caller, Scope};
 use crate::blobs::BlobId;
 use crate::engine::{IdempotencyKey, NewJob};
@@ -122,7 +120,7 @@ async fn sensing(app: &App, tenant: &Tenant, job: &Job) -> Result<(Sensing, u64)
     };
     let Some(input) = work.field.input else { return Err(no("is of a scene, which has no weights")) };
     let note = app.blobs.note(tenant, input).await?.ok_or_else(|| no("is of an input that is gone"))?;
-    let described = super::inputs::read_note(&note)?;
+    let described = super::super::inputs::read_note(&note)?;
     if !described.is_network() {
         return Err(no("is of a field that is no network"));
     }

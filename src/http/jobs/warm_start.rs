@@ -1,6 +1,7 @@
 //! What a warm start names: an earlier job, of which the surface is looked up when the new job is accepted.
 
-use super::{App, Problem, surface_blob};
+use super::estimate::surface_blob;
+use super::{App, Problem};
 use crate::blobs::BlobId;
 use crate::field::Fault;
 use crate::job::spec::{WarmStartSpec, Work};

@@ -13,7 +13,7 @@ const ID: &str = "$response.body#/id";
 const ASKED: &str = "$request.path.id";
 
 /// What can be done with a job once its id is known.
-const OF_A_JOB: [&str; 6] = ["get", "cancel", "events", "forget", "download", "differentiate"];
+const OF_A_JOB: [&str; 7] = ["get", "request", "cancel", "events", "forget", "download", "differentiate"];
 
 /// An operation, the statuses of its answers that lead on, the operation they lead to, and a parameter of it with the place of its
 /// value.

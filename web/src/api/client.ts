@@ -74,6 +74,11 @@ export async function readJob(id: string): Promise<Job> {
   return (await send(`/v1/jobs/${encodeURIComponent(id)}`)).json();
 }
 
+/** What the job was asked for by, with every default written out. */
+export async function readRequest(id: string): Promise<JobRequest> {
+  return (await send(`/v1/jobs/${encodeURIComponent(id)}/request`)).json();
+}
+
 export async function cancelJob(id: string): Promise<Job> {
   return (await send(`/v1/jobs/${encodeURIComponent(id)}/cancel`, { method: "POST" })).json();
 }

@@ -6,10 +6,15 @@ import { announce, el, fill } from "../dom";
 import { bytes, count } from "../format";
 import { codePanel } from "../job/code";
 import { problemBox } from "../job/problem";
-import { keepSent, type Sent } from "../job/requests";
 import type { Lattice } from "../view/lattice";
 import { FieldChooser } from "./field";
 import { Options } from "./options";
+
+/** A request, and the name of the file that its input was. */
+interface Made {
+  request: JobRequest;
+  file: string | null;
+}
 
 /** Milliseconds without a change before the service is asked. */
 const PAUSE = 500;
@@ -47,7 +52,7 @@ export class JobForm {
   }
 
   /** The request and its file, or a sentence that says what is missing. */
-  private request(): Sent | string {
+  private request(): Made | string {
     const chosen = this.field.chosen();
     if (typeof chosen === "string") return chosen;
     const request: JobRequest = { field: chosen.field };
@@ -58,7 +63,7 @@ export class JobForm {
     return { request, file: chosen.file };
   }
 
-  private recipe(): Sent | null {
+  private recipe(): Made | null {
     const made = this.request();
     return typeof made === "string" ? null : made;
   }
@@ -101,7 +106,6 @@ export class JobForm {
     fill(this.problem);
     try {
       const job = await submitJob(made.request);
-      keepSent(job.id, made);
       announce("The job was submitted");
       this.submitted(job);
     } catch (error) {

@@ -6,10 +6,12 @@ import { el, fill } from "../dom";
 import { moment, percent } from "../format";
 import { latticeName } from "../view/lattice";
 import { problemBox } from "./problem";
-import { sentFor } from "./requests";
-import { badge, retryJob } from "./view";
+import { badge, canRetry, retryJob } from "./view";
 
+/** Jobs that are shown at first, and that are added with every press of the button below them. */
 const SHOWN = 12;
+/** Most that the service lists in one page. */
+const MOST = 200;
 const EVERY = 5000;
 
 export class JobList {
@@ -18,6 +20,8 @@ export class JobList {
   private readonly trouble = el("div", {});
   private readonly rows = new Map<string, { element: HTMLElement; told: string }>();
   private readonly pictures = new Map<string, string>();
+  private readonly more = el("button", { type: "button", class: "small", hidden: true, onclick: () => this.showMore() }, "Show more");
+  private shown = SHOWN;
   private etag: string | null = null;
   private timer = 0;
   private reading = false;
@@ -29,6 +33,7 @@ export class JobList {
       el("h2", { id: "recent-heading" }, "Recent jobs"),
       this.trouble,
       this.list,
+      this.more,
     );
     document.addEventListener("visibilitychange", () => !document.hidden && this.refresh());
     void this.refresh();
@@ -40,11 +45,12 @@ export class JobList {
     if (this.reading) return;
     this.reading = true;
     try {
-      const answer = await send(`/v1/jobs?limit=${SHOWN}`, this.etag ? { headers: { "if-none-match": this.etag } } : {});
+      const answer = await send(`/v1/jobs?limit=${this.shown}`, this.etag ? { headers: { "if-none-match": this.etag } } : {});
       if (answer.status !== 304) {
         this.etag = answer.headers.get("etag");
-        const { jobs } = (await answer.json()) as { jobs: Job[] };
+        const { jobs, next_cursor } = (await answer.json()) as { jobs: Job[]; next_cursor?: string | null };
         this.show(jobs);
+        this.more.hidden = !next_cursor || this.shown >= MOST;
       }
       this.trouble.replaceChildren();
     } catch (error) {
@@ -56,11 +62,20 @@ export class JobList {
     }
   }
 
+  private async showMore(): Promise<void> {
+    const before = this.list.children.length;
+    this.shown = Math.min(MOST, this.shown + SHOWN);
+    this.etag = null;
+    await this.refresh();
+    // who came by keys goes on at the first that is new
+    this.list.children[before]?.querySelector("a")?.focus();
+  }
+
   private show(jobs: Job[]): void {
     const gone = new Set(this.rows.keys());
     const items = jobs.map((job) => {
       gone.delete(job.id);
-      const told = JSON.stringify([job.state, job.progress?.stage, job.progress?.fraction, job.outputs.length, this.open() === job.id, sentFor(job.id) !== null]);
+      const told = JSON.stringify([job.state, job.progress?.stage, job.progress?.fraction, job.outputs.length, this.open() === job.id]);
       const known = this.rows.get(job.id);
       if (known?.told === told) return known.element;
       const element = this.row(job);
@@ -94,9 +109,7 @@ export class JobList {
         "div",
         { class: "acts" },
         !ended(job.state) && button("Cancel", () => cancelJob(job.id)),
-        (job.state === "failed" || job.state === "canceled") &&
-          sentFor(job.id) !== null &&
-          button("Retry", async () => (location.hash = `#/jobs/${(await retryJob(job.id)).id}`)),
+        canRetry(job) && button("Retry", async () => (location.hash = `#/jobs/${(await retryJob(job.id)).id}`)),
       ),
     );
   }

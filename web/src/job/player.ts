@@ -55,16 +55,20 @@ export class Player {
   private async flow(front: Front, from: { middle: number[]; radius: number }, time: number): Promise<void> {
     const to = bounds(front.positions);
     const still = calm() || document.hidden || this.queue.length > MOST_WAITING;
-    const positions = still ? front.positions : front.from.slice();
-    this.viewer.showFront({ positions, triangles: front.triangles, places: front.places }, this.lattice, true);
-    if (still) return this.viewer.aim(to.middle, to.radius);
+    if (still) {
+      this.viewer.showFront({ ...front, carried: null }, this.lattice, 0);
+      return this.viewer.aim(to.middle, to.radius);
+    }
+    const moving = { ...front, positions: front.from.slice() };
+    const { positions } = moving;
+    this.viewer.showFront(moving, this.lattice, 0);
     const begin = performance.now();
     for (let part = 0; part < 1 && !this.stopped; ) {
       part = Math.min(1, (performance.now() - begin) / time);
       const t = part * part * (3 - 2 * part);
       for (let k = 0; k < positions.length; k++) positions[k] = front.from[k] + t * (front.positions[k] - front.from[k]);
       this.viewer.aim(to.middle.map((c, k) => from.middle[k] + t * (c - from.middle[k])), from.radius + t * (to.radius - from.radius));
-      this.viewer.showFront({ positions, triangles: front.triangles, places: front.places }, this.lattice, false);
+      this.viewer.showFront(moving, this.lattice, t);
       await frame();
     }
     await new Promise((resolve) => setTimeout(resolve, REST));

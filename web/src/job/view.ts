@@ -1,8 +1,8 @@
 /** One job: followed while it runs, then its result, report and downloads. */
 
-import { cancelJob, outputAddress, outputBytes, problemOf, readJob, submitJob } from "../api/client";
+import { cancelJob, outputAddress, outputBytes, problemOf, readJob, readRequest, submitJob } from "../api/client";
 import { follow } from "../api/sse";
-import { ended, type Job, type MeshEvent, type Output, type Progress, type State } from "../api/types";
+import { ended, type Job, type JobRequest, type MeshEvent, type Output, type Progress, type State } from "../api/types";
 import { announce, el, fill } from "../dom";
 import { moment, seconds } from "../format";
 import { checkerPicture } from "../view/colors";
@@ -18,7 +18,6 @@ import { outputList } from "./outputs";
 import { Player } from "./player";
 import { problemBox } from "./problem";
 import { reportView } from "./report";
-import { keepSent, sentFor } from "./requests";
 
 /** Bytes of a safetensors file that nearly always hold its header. */
 const HEADER = 16_384;
@@ -34,8 +33,9 @@ export class JobView {
   private readonly trouble = el("div", {});
   private readonly planar = el("figure", { class: "planar", hidden: true });
   private readonly results = el("div", { class: "results" });
-  private readonly code = codePanel(() => (this.job ? sentFor(this.job.id) : null));
+  private readonly code = codePanel(() => (this.request ? { request: this.request, file: null } : null));
   private job: Job | null = null;
+  private request: JobRequest | null = null;
   private opened = new AbortController();
   private addresses: string[] = [];
   /** Whether the heading is to have the focus once it says what is open. */
@@ -85,8 +85,7 @@ export class JobView {
       const job = typeof what === "string" ? await readJob(what) : what;
       if (signal.aborted) return;
       this.take(job);
-      this.code.element.hidden = sentFor(job.id) === null;
-      this.code.refresh();
+      void this.showCode(job, signal);
       if (ended(job.state)) await this.result(job, signal);
       else await this.watch(job, signal);
     } catch (error) {
@@ -107,7 +106,7 @@ export class JobView {
   private reset(): void {
     this.opened.abort();
     this.opened = new AbortController();
-    this.job = null;
+    this.job = this.request = null;
     for (const address of this.addresses.splice(0)) URL.revokeObjectURL(address);
     for (const part of [this.head, this.live, this.trouble, this.results, this.planar]) part.replaceChildren();
     this.lead.textContent = "";
@@ -123,8 +122,6 @@ export class JobView {
     this.job = job;
     this.heading.textContent = job.labels.name ?? `Job ${job.id.slice(0, 8)}`;
     const lattice = job.shrink ? latticeName(job.shrink.lattice) : job.kind;
-    const failed = job.state === "failed" || job.state === "canceled";
-    const sent = sentFor(job.id) !== null;
     const acting = this.head.contains(document.activeElement);
     fill(
       this.head,
@@ -136,8 +133,7 @@ export class JobView {
       el("code", { class: "id" }, job.id),
       el("span", { class: "spacer" }),
       !ended(job.state) && el("button", { type: "button", disabled: job.state === "canceling", onclick: () => this.act(() => cancelJob(job.id)) }, "Cancel"),
-      failed && sent && el("button", { type: "button", onclick: () => this.retry(job) }, "Retry"),
-      failed && !sent && el("span", { class: "hint" }, "It was not sent from this browser, so it cannot be sent again from here."),
+      canRetry(job) && el("button", { type: "button", onclick: () => this.retry(job) }, "Retry"),
     );
     // the button that was pressed may be gone
     if (this.focusing || acting) this.focus();
@@ -162,6 +158,16 @@ export class JobView {
     } catch (error) {
       fill(this.trouble, problemBox(problemOf(error)));
     }
+  }
+
+  /** The same job as a program, once the service has said what it was asked for. */
+  private async showCode(job: Job, signal: AbortSignal): Promise<void> {
+    if (job.kind === "sensitivity") return;
+    const request = await readRequest(job.id).catch(() => null);
+    if (signal.aborted) return;
+    this.request = request;
+    this.code.element.hidden = request === null;
+    this.code.refresh();
   }
 
   private async watch(job: Job, signal: AbortSignal): Promise<void> {
@@ -260,12 +266,14 @@ async function readDistances(file: Output, surface: Surface): Promise<Distances>
   return ofDiagonal(distances, surface);
 }
 
+/** Whether a job came to nothing, and can be sent again: a sensitivity was asked for by a file. */
+export function canRetry(job: Job): boolean {
+  return (job.state === "failed" || job.state === "canceled") && job.kind !== "sensitivity";
+}
+
 /** Sends a job's request again. */
 export async function retryJob(id: string): Promise<Job> {
-  const sent = sentFor(id);
-  if (!sent) throw new Error("the request of this job is not known here, because it was not sent from this browser");
-  const job = await submitJob(sent.request);
-  keepSent(job.id, sent);
+  const job = await submitJob(await readRequest(id));
   announce("The job was submitted again");
   return job;
 }

@@ -12,6 +12,8 @@ export interface Drawn {
   uv: Float32Array | null;
   /** Unit vectors: the checkerboard is then that of places on the sphere. */
   places: Float32Array | null;
+  /** Places whose checkerboard fades into that of `places`. */
+  carried: Float32Array | null;
   triangles: Uint32Array;
   texture: Picture | null;
   octahedral: boolean;
@@ -26,8 +28,8 @@ export interface Renderer {
   readonly name: "WebGL" | "Canvas 2D";
   /** Another shape, or other values on it. */
   take(drawn: Drawn): void;
-  /** The same shape with vertices elsewhere. */
-  move(positions: Float32Array, normals: Float32Array): void;
+  /** The same shape with vertices elsewhere, and how much of the checkerboard is that of `places`: all of it at 1. */
+  move(positions: Float32Array, normals: Float32Array, arrived: number): void;
   draw(mode: Mode, sight: Sight): void;
   resize(width: number, height: number): void;
   dispose(): void;

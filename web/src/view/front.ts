@@ -8,6 +8,8 @@ export interface Front {
   triangles: Uint32Array;
   /** Unit vectors: where on the sphere each vertex is. */
   places: Float32Array;
+  /** The places of the front before, carried along, where the event had its own: their checkerboard fades into that of `places`. */
+  carried: Float32Array | null;
   /** Where each vertex comes from on the front before, so that one front flows into the next. */
   from: Float32Array;
 }
@@ -38,10 +40,10 @@ export function firstFront(event: MeshEvent): Front {
   const { positions, triangles, places } = decode(event);
   const { middle, radius } = bounds(positions);
   const outward = normalized(positions.map((c, k) => c - middle[k % 3]));
-  return { positions, triangles, places: places ?? outward, from: outward.map((c, k) => middle[k % 3] + radius * c) };
+  return { positions, triangles, places: places ?? outward, carried: places && outward, from: outward.map((c, k) => middle[k % 3] + radius * c) };
 }
 
-/** A later front: where the event has no places, they flow on from the nearest vertices of the front before. */
+/** A later front: places flow on from the nearest vertices of the front before, until the event has its own. */
 export function nextFront(event: MeshEvent, before: Front): Front {
   const { positions, triangles, places } = decode(event);
   const cells = new Cells(before.positions);
@@ -60,7 +62,8 @@ export function nextFront(event: MeshEvent, before: Front): Front {
     }
     for (let k = 0; k < 3; k++) from[v + k] /= total || 1;
   }
-  return { positions, triangles, places: places ?? normalized(carried), from };
+  const flown = normalized(carried);
+  return { positions, triangles, places: places ?? flown, carried: places && flown, from };
 }
 
 function normalized(vectors: Float32Array): Float32Array {

@@ -23,11 +23,11 @@ import { gridLine, MAJOR, MINOR, type Picture } from "./colors";
 import { MODES, type Drawn, type Mode, type Renderer } from "./drawn";
 
 const VERTEX = `
-in vec3 position; in vec3 normal; in vec2 uv; in vec3 place; in float value;
+in vec3 position; in vec3 normal; in vec2 uv; in vec3 place; in vec3 carried; in float value;
 uniform mat4 uMatrix;
-out vec3 vNormal; out vec2 vUv; out vec3 vPlace; out vec3 vCorner; flat out float vValue;
+out vec3 vNormal; out vec2 vUv; out vec3 vPlace; out vec3 vCarried; out vec3 vCorner; flat out float vValue;
 void main() {
-  vNormal = normal; vUv = uv; vPlace = place; vValue = value;
+  vNormal = normal; vUv = uv; vPlace = place; vCarried = carried; vValue = value;
   int corner = gl_VertexID % 3;
   vCorner = vec3(corner == 0, corner == 1, corner == 2);
   gl_Position = uMatrix * vec4(position, 1.0);
@@ -35,8 +35,8 @@ void main() {
 
 const FRAGMENT = `
 precision highp float;
-in vec3 vNormal; in vec2 vUv; in vec3 vPlace; in vec3 vCorner; flat in float vValue;
-uniform int uMode; uniform bool uPlaces; uniform bool uOctahedral; uniform bool uLit;
+in vec3 vNormal; in vec2 vUv; in vec3 vPlace; in vec3 vCarried; in vec3 vCorner; flat in float vValue;
+uniform int uMode; uniform float uArrived; uniform bool uPlaces; uniform bool uOctahedral; uniform bool uLit;
 uniform vec3 uLight; uniform sampler2D uMap; uniform sampler2D uRamp; uniform sampler2D uLines;
 out vec4 outColor;
 const float PI = 3.141592653589793;
@@ -72,10 +72,15 @@ vec3 checker(vec2 uv) {
 }
 
 // four samples in a pixel, by directions: a chart has a seam, the sphere has none
+vec3 checkerOf(vec3 place) {
+  vec3 dx = dFdx(place) / 4.0, dy = dFdy(place) / 4.0;
+  return 0.25 * (checker(chartPlace(normalize(place + dx + dy))) + checker(chartPlace(normalize(place + dx - dy)))
+               + checker(chartPlace(normalize(place - dx + dy))) + checker(chartPlace(normalize(place - dx - dy))));
+}
+
 vec3 checkerOfPlaces() {
-  vec3 dx = dFdx(vPlace) / 4.0, dy = dFdy(vPlace) / 4.0;
-  return 0.25 * (checker(chartPlace(normalize(vPlace + dx + dy))) + checker(chartPlace(normalize(vPlace + dx - dy)))
-               + checker(chartPlace(normalize(vPlace - dx + dy))) + checker(chartPlace(normalize(vPlace - dx - dy))));
+  vec3 color = checkerOf(vPlace);
+  return uArrived < 1.0 ? mix(checkerOf(vCarried), color, uArrived) : color;
 }
 
 float line(float c, float parts, float width) {
@@ -148,6 +153,7 @@ class GlRenderer implements Renderer {
         uMatrix: { value: new Matrix4() },
         uLight: { value: new Vector3() },
         uMode: { value: 0 },
+        uArrived: { value: 1 },
         uPlaces: { value: false },
         uOctahedral: { value: false },
         uLit: { value: true },
@@ -174,12 +180,14 @@ class GlRenderer implements Renderer {
     geometry.setAttribute("normal", spread(drawn.normals, 3));
     geometry.setAttribute("uv", spread(drawn.uv, 2));
     geometry.setAttribute("place", spread(drawn.places, 3));
+    geometry.setAttribute("carried", spread(drawn.carried, 3));
     const values = new Float32Array(corners);
     if (drawn.values) for (let c = 0; c < corners; c++) values[c] = drawn.values[Math.floor(c / 3)];
     geometry.setAttribute("value", new BufferAttribute(values, 1));
     this.mesh.geometry.dispose();
     this.mesh.geometry = geometry;
     const { uniforms } = this.mesh.material;
+    uniforms.uArrived.value = drawn.carried ? 0 : 1;
     uniforms.uPlaces.value = drawn.places !== null;
     uniforms.uOctahedral.value = drawn.octahedral;
     uniforms.uLit.value = drawn.lit;
@@ -190,7 +198,8 @@ class GlRenderer implements Renderer {
     if (drawn.ramp) this.swap("uRamp", strip(drawn.ramp, 1));
   }
 
-  move(positions: Float32Array, normals: Float32Array): void {
+  move(positions: Float32Array, normals: Float32Array, arrived: number): void {
+    if (this.drawn!.carried) this.mesh.material.uniforms.uArrived.value = arrived;
     const triangles = this.drawn!.triangles;
     for (const [name, items] of [["position", positions], ["normal", normals]] as const) {
       const attribute = this.mesh.geometry.getAttribute(name) as BufferAttribute;

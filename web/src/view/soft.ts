@@ -16,6 +16,7 @@ export class SoftRenderer implements Renderer {
   readonly name = "Canvas 2D";
   private readonly context: CanvasRenderingContext2D;
   private drawn: Drawn | null = null;
+  private arrived = 0;
   private image!: ImageData;
   private depth!: Float32Array;
 
@@ -28,10 +29,12 @@ export class SoftRenderer implements Renderer {
 
   take(drawn: Drawn): void {
     this.drawn = drawn;
+    this.arrived = drawn.carried ? 0 : 1;
   }
 
-  move(positions: Float32Array, normals: Float32Array): void {
+  move(positions: Float32Array, normals: Float32Array, arrived: number): void {
     this.drawn = { ...this.drawn!, positions, normals };
+    if (this.drawn.carried) this.arrived = arrived;
   }
 
   resize(width: number, height: number): void {
@@ -68,7 +71,7 @@ export class SoftRenderer implements Renderer {
       const facing = normals[3 * v] * light[0] + normals[3 * v + 1] * light[1] + normals[3 * v + 2] * light[2];
       seen[4 * v + 3] = drawn.lit ? 1 - SHADE[mode] * (1 - Math.max(0, facing)) : 1;
     }
-    const shader = shaderOf(drawn, mode);
+    const shader = shaderOf(drawn, mode, this.arrived);
     const out: Rgb = [0, 0, 0];
     for (let t = 0; t < triangles.length; t += 3) {
       const [a, b, c] = [4 * triangles[t], 4 * triangles[t + 1], 4 * triangles[t + 2]];
@@ -106,8 +109,8 @@ export class SoftRenderer implements Renderer {
 /** Writes the colour at a place in triangle `t`, given by its weights of the corners and their slopes in x and y. */
 type Shader = (t: number, wa: number, wb: number, wc: number, slopes: readonly number[], out: Rgb) => void;
 
-function shaderOf(drawn: Drawn, mode: Mode): Shader {
-  const { triangles, uv, places, texture, values, ramp, normals } = drawn;
+function shaderOf(drawn: Drawn, mode: Mode, arrived: number): Shader {
+  const { triangles, uv, places, carried, texture, values, ramp, normals } = drawn;
   const mean = (items: Float32Array, size: number, k: number, t: number, wa: number, wb: number, wc: number): number =>
     wa * items[size * triangles[3 * t] + k] + wb * items[size * triangles[3 * t + 1] + k] + wc * items[size * triangles[3 * t + 2] + k];
   const put = (out: Rgb, color: readonly number[]): void => {
@@ -115,10 +118,15 @@ function shaderOf(drawn: Drawn, mode: Mode): Shader {
   };
   if (mode === "checker" && places) {
     const hue = memo(drawn.octahedral);
-    return (t, wa, wb, wc, _, out) => {
-      const d: [number, number, number] = [0, 1, 2].map((k) => mean(places, 3, k, t, wa, wb, wc)) as [number, number, number];
+    const at = (of: Float32Array, t: number, wa: number, wb: number, wc: number): Rgb => {
+      const d: [number, number, number] = [0, 1, 2].map((k) => mean(of, 3, k, t, wa, wb, wc)) as [number, number, number];
       const length = Math.hypot(...d) || 1;
-      put(out, hue(...chartPlace([d[0] / length, d[1] / length, d[2] / length], drawn.octahedral)));
+      return hue(...chartPlace([d[0] / length, d[1] / length, d[2] / length], drawn.octahedral));
+    };
+    if (!carried || arrived >= 1) return (t, wa, wb, wc, _, out) => put(out, at(places, t, wa, wb, wc));
+    return (t, wa, wb, wc, _, out) => {
+      const [before, after] = [at(carried, t, wa, wb, wc), at(places, t, wa, wb, wc)];
+      for (let k = 0; k < 3; k++) out[k] = before[k] + arrived * (after[k] - before[k]);
     };
   }
   if (mode === "checker" && texture && uv) {

@@ -5,6 +5,7 @@ import { count, figure, fixed, percent } from "../format";
 import { Orbit, project, Window } from "./camera";
 import { css, DIVERGING, gridLine, MAJOR, SEQUENTIAL, type Ramp } from "./colors";
 import { MODES, type Drawn, type Mode } from "./drawn";
+import type { Front } from "./front";
 import { angles, direction, isOctahedral, latticeName, type Lattice, type Vec3 } from "./lattice";
 import { areaRatios, quantile, roundUp } from "./measures";
 import { BoxTree, UvGrid, type Hit } from "./picking";
@@ -126,10 +127,10 @@ export class Viewer {
     this.refresh();
   }
 
-  /** A front while it shrinks; its checkerboard is that of `places`. */
-  showFront(front: { positions: Float32Array; triangles: Uint32Array; places: Float32Array }, lattice: Lattice, fresh: boolean): void {
+  /** A front while it shrinks, `arrived` from 0 to 1 on its way; its checkerboard is that of `places`, into which that of `carried` fades. */
+  showFront(front: Omit<Front, "from">, lattice: Lattice, arrived: number): void {
     const normals = vertexNormals(front.positions, front.triangles);
-    if (!fresh) return this.space.move(front.positions, normals);
+    if (arrived > 0) return this.space.move(front.positions, normals, arrived);
     const octahedral = isOctahedral(lattice);
     this.surface = null;
     this.point(null);
@@ -198,7 +199,7 @@ export class Viewer {
       ramp = SEQUENTIAL;
     }
     const octahedral = isOctahedral(surface.lattice);
-    const same = { uv: surface.uv, places: null, triangles: surface.triangles, texture: surface.texture, octahedral, values, ramp };
+    const same = { uv: surface.uv, places: null, carried: null, triangles: surface.triangles, texture: surface.texture, octahedral, values, ramp };
     const flat = new Float32Array((3 * surface.uv.length) / 2);
     for (let v = 0; v < surface.uv.length / 2; v++) flat.set([surface.uv[2 * v], 1 - surface.uv[2 * v + 1], 0], 3 * v);
     const inSpace: Drawn = { ...same, positions: surface.positions, normals: surface.normals, lit: true };

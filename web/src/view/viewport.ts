@@ -86,9 +86,9 @@ export class Viewport {
     this.ask();
   }
 
-  move(positions: Float32Array, normals: Float32Array): void {
+  move(positions: Float32Array, normals: Float32Array, arrived: number): void {
     if (this.drawn) this.drawn = { ...this.drawn, positions, normals };
-    this.renderer.move(positions, normals);
+    this.renderer.move(positions, normals, arrived);
     this.ask();
   }
 

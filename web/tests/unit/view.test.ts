@@ -50,11 +50,15 @@ describe("fronts", () => {
     const places = [[0, 0, 1], [1, 0, 0], [0, -1, 0], [-0.6, 0.8, 0]];
     for (const front of [firstFront(event(TETRAHEDRON, FACES, places)), nextFront(event(TETRAHEDRON, FACES, places), firstFront(event(TETRAHEDRON, FACES)))]) {
       places.flat().forEach((c, k) => expect(front.places[k]).toBeCloseTo(c, 4));
+      // what was carried so far, to fade from
+      expect(front.carried).toHaveLength(front.places.length);
+      expect(Math.hypot(...front.carried!.subarray(0, 3))).toBeCloseTo(1, 5);
     }
   });
 
   it("carry places along where it has none", () => {
     const first = firstFront(event(TETRAHEDRON, FACES));
+    expect(first.carried).toBeNull();
     const { middle } = bounds(first.positions);
     const outward = TETRAHEDRON[1].map((c, k) => c - middle[k]);
     const length = Math.hypot(...outward);
