@@ -58,5 +58,5 @@ async fn a_request_that_is_read_back_makes_the_same_job_anew() {
         }
     }
     problem(app.get("/v1/jobs/01a204e3-7cfe-7621-aecf-7e493a0df60a/request").await, 404, "unknown_job").await;
-    problem(app.get(&format!("/v1/jobs/{first}/request?whole=true")).await, 400, "unknown_parameter").await;
+    problem(app.get(&format!("/v1/jobs/{first}/request?whole=true")).await, 400, "invalid_query").await;
 }
