@@ -202,3 +202,28 @@ test("a job is opened by its address, and the list shows its picture", async ({ 
   await page.locator(".recent li.open img").scrollIntoViewIfNeeded();
   await expect.poll(() => page.locator(".recent li.open img").evaluate((image: HTMLImageElement) => image.naturalWidth)).toBeGreaterThan(0);
 });
+
+test("older jobs are listed on demand, and a job that was sent from elsewhere is sent again", async ({ page, service }) => {
+  const send = async (scene: unknown): Promise<string> => {
+    const body = { field: { scene }, labels: { name: "sent from elsewhere" } };
+    const init = { method: "POST", headers: { "content-type": "application/json", prefer: "wait=60" }, body: JSON.stringify(body) };
+    return ((await (await fetch(`${service.api}/v1/jobs`, init)).json()) as { id: string }).id;
+  };
+  const ring = await send({ torus: { major: 0.5, minor: 0.2 } });
+  for (let k = 0; k < 12; k++) await send({ circle: { radius: 0.5 } });
+  await openPage(page, service);
+  await expect(page.locator(".recent li")).toHaveCount(12);
+  const older = page.locator(`.recent a[href="#/jobs/${ring}"]`);
+  await expect(older).toHaveCount(0);
+  await page.getByRole("button", { name: "Show more" }).click();
+  await expect(older).toHaveCount(1);
+  await accessible(page);
+  await older.click();
+  await reaches(page, "failed");
+  await page.getByText("The same job as a program").last().click();
+  await expect(page.locator(".job .code-text")).toContainText('"torus"');
+  await page.locator(".job-head").getByRole("button", { name: "Retry" }).click();
+  await expect(page).not.toHaveURL(new RegExp(ring));
+  await reaches(page, "failed");
+  await expect(page.locator(".job .problem")).toContainText("genus");
+});
