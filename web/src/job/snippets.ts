@@ -114,35 +114,37 @@ function rust(recipe: Recipe): string {
   const body = JSON.stringify(withPlaceholder(recipe), null, 4)
     .replace(`"${PLACEHOLDER}"`, "input")
     .replaceAll("\n", "\n    ");
-  const key = recipe.key ? `.bearer_auth(std::env::var("SHRINKD_KEY")?)` : "";
   return [
     `// cargo add serde_json; cargo add reqwest --features blocking,json`,
+    "use reqwest::blocking::{Client, RequestBuilder, Response};",
     "use serde_json::{Value, json};",
+    "use std::error::Error;",
     "",
-    "fn checked(answer: reqwest::blocking::Response) -> Result<reqwest::blocking::Response, Box<dyn std::error::Error>> {",
+    "fn answer(request: RequestBuilder) -> Result<Response, Box<dyn Error>> {",
+    recipe.key ? `    let answer = request.bearer_auth(std::env::var("SHRINKD_KEY")?).send()?;` : "    let answer = request.send()?;",
     "    if answer.status().is_success() { Ok(answer) } else { Err(answer.text()?.into()) }",
     "}",
     "",
-    "fn main() -> Result<(), Box<dyn std::error::Error>> {",
+    "fn main() -> Result<(), Box<dyn Error>> {",
     `    let base = ${JSON.stringify(recipe.base)};`,
-    "    let client = reqwest::blocking::Client::new();",
+    "    let client = Client::new();",
     ...(recipe.file === null
       ? []
       : [
           `    let file = std::fs::read(${JSON.stringify(recipe.file)})?;`,
-          `    let described: Value = checked(client.post(format!("{base}/v1/inputs"))${key}.body(file).send()?)?.json()?;`,
+          `    let described: Value = answer(client.post(format!("{base}/v1/inputs")).body(file))?.json()?;`,
           `    let input = described["id"].as_str().ok_or("no id")?;`,
         ]),
     `    let request = json!(${body});`,
-    `    let mut job: Value = checked(client.post(format!("{base}/v1/jobs"))${key}.json(&request).send()?)?.json()?;`,
+    `    let mut job: Value = answer(client.post(format!("{base}/v1/jobs")).json(&request))?.json()?;`,
     `    let id = job["id"].as_str().ok_or("no id")?.to_owned();`,
     `    while !["succeeded", "failed", "canceled"].contains(&job["state"].as_str().unwrap_or_default()) {`,
-    `        job = checked(client.get(format!("{base}/v1/jobs/{id}?wait=20"))${key}.send()?)?.json()?;`,
+    `        job = answer(client.get(format!("{base}/v1/jobs/{id}?wait=20")))?.json()?;`,
     "    }",
     `    if job["state"] != "succeeded" {`,
     `        return Err(format!("{}: {}", job["state"], job["problem"]).into());`,
     "    }",
-    `    let glb = checked(client.get(format!("{base}/v1/jobs/{id}/outputs/glb"))${key}.send()?)?.bytes()?;`,
+    `    let glb = answer(client.get(format!("{base}/v1/jobs/{id}/outputs/glb")))?.bytes()?;`,
     `    std::fs::write(${JSON.stringify(target(recipe))}, glb)?;`,
     "    Ok(())",
     "}",

@@ -31,6 +31,12 @@ describe("programs", () => {
     expect(snippet("Rust", FILE)).toContain('"input": input,');
   });
 
+  it("in Rust are compiled with the service's examples", async () => {
+    const request = { field: { input: "sha256:0", latent_row: 1 }, shrink: { lattice: { octahedral: { n: 24 } }, relax_uv: true }, labels: { name: "blob" } };
+    const program = snippet("Rust", { base: SCENE.base, request, file: "blob.safetensors", key: true });
+    await expect(`${program}\n`).toMatchFileSnapshot("../../../examples/page_program.rs");
+  });
+
   it("let the shell read nothing in a request with an input", () => {
     const text = snippet("curl", { ...FILE, request: { ...FILE.request, labels: { name: "`id` $HOME \\" } } });
     expect(text).toContain("\\`id\\` \\$HOME");
