@@ -5,6 +5,7 @@
 //! and depends on nothing but the boxes.
 
 use glam::DVec3;
+use std::ops::ControlFlow;
 
 /// An axis-aligned box.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -78,8 +79,8 @@ impl Bvh {
         Self { nodes, order }
     }
 
-    /// Calls `visit` with every box index whose leaf overlaps `query` (a superset of the boxes that overlap it).
-    pub fn overlapping(&self, query: &Aabb, mut visit: impl FnMut(u32)) {
+    /// Calls `visit` with every box index whose leaf overlaps `query` (a superset of the boxes that overlap it), until it breaks off.
+    pub fn overlapping(&self, query: &Aabb, mut visit: impl FnMut(u32) -> ControlFlow<()>) {
         let (mut stack, mut top) = ([0u32; STACK], 0);
         let mut at = 0u32;
         if self.nodes.is_empty() {
@@ -95,7 +96,9 @@ impl Bvh {
                     continue;
                 }
                 for &i in &self.order[node.first as usize..(node.first + node.count) as usize] {
-                    visit(i);
+                    if visit(i).is_break() {
+                        return;
+                    }
                 }
             }
             if top == 0 {

@@ -5,11 +5,15 @@ use super::predicates::{orient2d, orient3d};
 use super::{corners, map_chunks};
 use crate::settings::{Canceled, Settings};
 use glam::{DVec2, DVec3};
+use std::ops::ControlFlow;
 
-/// Triangles of a mesh that meet others. A surface that is folded all over has hundreds of millions of pairs: they are counted, not kept.
+/// Pairs that are counted of one triangle with those after it: a surface that is folded all over has billions, which nobody wants to wait for.
+const MOST: u32 = 1000;
+
+/// Triangles of a mesh that meet others.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Crossing {
-    /// Pairs.
+    /// Pairs, of one triangle with those after it at most 1,000.
     pub pairs: u64,
     /// The triangles that meet one that comes after them, in ascending order.
     pub triangles: Vec<u32>,
@@ -41,6 +45,7 @@ pub fn self_intersections(
             let meets =
                 later && boxes[i].overlaps(&boxes[j as usize]) && pair_meets(vertices, t, triangles[j as usize]);
             met += u32::from(meets);
+            if met < MOST { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
         });
         met
     })?;
@@ -244,5 +249,24 @@ mod tests {
             first.dedup();
             assert_eq!(found, Crossing { pairs: all.len() as u64, triangles: first });
         });
+    }
+
+    #[test]
+    fn of_a_surface_that_is_folded_all_over_each_triangle_counts_a_thousand() {
+        // all of them through the origin
+        let turned = |k: u32| {
+            let (sin, cos) = (0.002 * f64::from(k)).sin_cos();
+            [v(1.0, cos, sin), v(1.0, -cos, -sin), v(-1.0, 0.0, 0.0)].map(|p| p.as_vec3().as_dvec3())
+        };
+        let count = MOST + 500;
+        let vertices: Vec<DVec3> = (0..count).flat_map(turned).collect();
+        let triangles: Vec<[u32; 3]> = (0..count).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect();
+        let expected: u64 = (0..count).map(|t| u64::from((count - 1 - t).min(MOST))).sum();
+        for threads in [1, 3] {
+            with_settings(threads, |settings| {
+                let found = self_intersections(&vertices, &triangles, settings).unwrap();
+                assert_eq!((found.pairs, found.triangles.len()), (expected, count as usize - 1));
+            });
+        }
     }
 }

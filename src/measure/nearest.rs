@@ -4,6 +4,7 @@ use super::bvh::{Aabb, Bvh};
 use super::{corners, map_chunks};
 use crate::settings::{Canceled, Settings};
 use glam::DVec3;
+use std::ops::ControlFlow;
 
 /// Answers closest-point queries on a set of triangles.
 #[derive(Clone, Debug)]
@@ -83,9 +84,9 @@ impl Nearest {
         let mut found = false;
         let reach = Aabb { min: p - radius, max: p + radius };
         self.tree.overlapping(&reach, |i| {
-            found = found
-                || (p.distance_squared(closest_on_triangle(p, self.triangles[i as usize])) <= radius * radius
-                    && wanted(i));
+            let within = p.distance_squared(closest_on_triangle(p, self.triangles[i as usize])) <= radius * radius;
+            found = within && wanted(i);
+            if found { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
         });
         found
     }

@@ -5,6 +5,7 @@ use super::super::map_chunks;
 use super::super::predicates::orient2d;
 use crate::settings::{Canceled, Settings};
 use glam::DVec2;
+use std::ops::ControlFlow;
 
 /// How many times the direction of travel turns around, counter-clockwise positive: 1 for a simple polygon with the
 /// inside on its left. Edges without length are passed over.
@@ -31,7 +32,7 @@ pub(super) fn crossings(polygon: &[DVec2], settings: &Settings<'_>) -> Result<Ve
         tree.overlapping(bounds, |j| {
             let k = j as usize;
             if k <= i || !bounds.overlaps(&boxes[k]) {
-                return;
+                return ControlFlow::Continue(());
             }
             let ([a, b], [c, d]) = (ends(i), ends(k));
             let meet = if i + 1 == k {
@@ -44,6 +45,7 @@ pub(super) fn crossings(polygon: &[DVec2], settings: &Settings<'_>) -> Result<Ve
             if meet {
                 hits.push((i as u32, j));
             }
+            ControlFlow::Continue(())
         });
         hits.sort_unstable();
         hits
