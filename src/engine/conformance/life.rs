@@ -4,7 +4,6 @@ use super::super::{Depth, Engine, EngineError, IdempotencyKey, ListQuery, NewJob
 use super::{PATIENCE, claim_one, labeled, new_job, own, progress, state, submit, success};
 use crate::job::{Failure, JobId, JobKind, State};
 use crate::tenant::Tenant;
-use futures::StreamExt;
 use std::sync::Arc;
 use std::time::Duration;
 

@@ -1,7 +1,7 @@
 //! Ends that somebody is to be told.
 
 use super::super::{DueNotice, Engine, ListQuery, NewJob};
-use super::{PATIENCE, claim_one, own, submit, success, tenant};
+use super::{PATIENCE, claim_one, new_job, own, submit, success, tenant};
 use crate::job::{JobSpec, State};
 use jiff::Timestamp;
 use serde_json::json;

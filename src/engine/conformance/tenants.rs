@@ -1,12 +1,10 @@
 //! Tenants: apart, in turn, and within their quotas.
 
 use super::super::{Claim, Engine, Forgotten, IdempotencyKey, ListQuery, NewJob, Outcome, Renewal, Submitted, follow};
-use super::{PATIENCE, QUEUE, claim_one, progress, submit, success, tenant};
+use super::{PATIENCE, QUEUE, claim_one, labeled, new_job, progress, submit, success, tenant};
 use crate::blobs::BlobId;
 use crate::job::{JobId, JobSpec, State};
-use crate::quota::Exceeded;
-use crate::quota::HOUR;
-use futures::StreamExt;
+use crate::quota::{Exceeded, HOUR};
 use serde_json::json;
 use std::sync::Arc;
 use std::time::Duration;

@@ -115,7 +115,8 @@ function rust(recipe: Recipe): string {
     .replace(`"${PLACEHOLDER}"`, "input")
     .replaceAll("\n", "\n    ");
   return [
-    `// cargo add serde_json; cargo add reqwest --features blocking,json`,
+    "//! Submits a job, waits for its end and saves what it made. Needs: cargo add serde_json; cargo add reqwest --features blocking,json",
+    "",
     "use reqwest::blocking::{Client, RequestBuilder, Response};",
     "use serde_json::{Value, json};",
     "use std::error::Error;",
