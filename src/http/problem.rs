@@ -374,6 +374,7 @@ mod tests {
             "src/field/scene/parse.rs",
             "src/grpc/message.rs",
             "src/http/jobs.rs",
+            "src/http/jobs/estimate.rs",
             "src/http/jobs/warm_start.rs",
             "src/job/spec.rs",
             "src/job/spec/read.rs",

@@ -83,9 +83,21 @@ export async function cancelJob(id: string): Promise<Job> {
   return (await send(`/v1/jobs/${encodeURIComponent(id)}/cancel`, { method: "POST" })).json();
 }
 
-export async function uploadInput(file: Blob): Promise<Input> {
+/** Options of a field without which some files cannot be read: they are said when a file is uploaded, too. */
+const READING = ["family", "encoding", "activation", "w0", "skip"];
+
+/** The query of an upload that says those of a field's options that it takes. */
+export function readingQuery(options: Record<string, unknown>): string {
+  const said = READING.filter((name) => options[name] !== undefined).map((name) => {
+    const value = options[name];
+    return [name, typeof value === "string" ? value : JSON.stringify(value)];
+  });
+  return said.length > 0 ? `?${new URLSearchParams(said)}` : "";
+}
+
+export async function uploadInput(file: Blob, options: Record<string, unknown>): Promise<Input> {
   const headers = { "content-type": "application/octet-stream" };
-  return (await send("/v1/inputs", { method: "POST", headers, body: file })).json();
+  return (await send(`/v1/inputs${readingQuery(options)}`, { method: "POST", headers, body: file })).json();
 }
 
 /** All bytes of an output, or some of them. */

@@ -28,7 +28,13 @@ export class FieldChooser {
   private readonly editor: HTMLElement;
   private readonly described = el("div", { class: "described", "aria-live": "polite" });
   private readonly drop: HTMLElement;
+  private readonly options = el("textarea", { id: "field-options", rows: 3, spellcheck: "false", autocapitalize: "off", placeholder: '{"w0": 12, "domain": {"min": [-1, -1, -1], "max": [1, 1, 1]}}' });
+  private readonly said: HTMLElement;
   private input: Input | null = null;
+  /** Why there is no field now, where there is none. */
+  private missing: string | null = null;
+  /** Counts what was chosen, so that an upload that ends late does not replace what was chosen after it. */
+  private choices = 0;
   private name = FIRST;
   private fileName: string | null = null;
   private latentRow = el("input", { type: "number", id: "latent-row", min: 0, step: 1, value: 0, oninput: () => this.changed() });
@@ -55,6 +61,15 @@ export class FieldChooser {
       this.faults.replaceChildren();
       this.changed();
     });
+    // a file that was refused for want of them is read again by choosing it again
+    this.options.addEventListener("input", () => this.changed());
+    this.said = el(
+      "details",
+      { class: "editor" },
+      el("summary", {}, "What a file does not say"),
+      el("label", { for: "field-options", class: "hint" }, "Options of a network or a grid as JSON, taken with the file: its w0, family, domain, sign and others"),
+      this.options,
+    );
     this.drop = el(
       "div",
       { class: "drop" },
@@ -70,6 +85,7 @@ export class FieldChooser {
       this.examples,
       this.drop,
       this.file,
+      this.said,
       this.described,
       this.editor,
       this.faults,
@@ -80,8 +96,11 @@ export class FieldChooser {
   /** The field, or a sentence that says what is missing. */
   chosen(): Chosen | string {
     const { name, fileName: file } = this;
+    if (this.missing !== null) return this.missing;
     if (this.input) {
-      const field: JobRequest["field"] = { input: this.input.id };
+      const options = this.fieldOptions();
+      if (typeof options === "string") return options;
+      const field: JobRequest["field"] = { ...options, input: this.input.id };
       const { latent_size: size, latent_rows: rows, dimension } = this.input.description as { latent_size?: number; latent_rows?: number; dimension?: number };
       if (size) {
         const numbers = this.latentCode.value.split(/[\s,;[\]]+/).filter(Boolean).map(Number);
@@ -101,11 +120,23 @@ export class FieldChooser {
     }
   }
 
+  /** What the file does not say, or a sentence about it. */
+  private fieldOptions(): Record<string, unknown> | string {
+    if (this.options.value.trim() === "") return {};
+    try {
+      const options: unknown = JSON.parse(this.options.value);
+      const isObject = typeof options === "object" && options !== null && !Array.isArray(options);
+      return isObject ? (options as Record<string, unknown>) : "What the file does not say has to be a JSON object.";
+    } catch (error) {
+      return `What the file does not say is not JSON: ${(error as Error).message}`;
+    }
+  }
+
   /** Shows what is wrong with the scene, each fault with the place it is at. */
   setFaults(faults: Fault[]): void {
     const ours = faults.filter((fault) => fault.pointer.startsWith("/field/"));
     this.scene.setAttribute("aria-invalid", String(ours.length > 0));
-    if (ours.length > 0 && !this.input) this.editor.setAttribute("open", "");
+    if (ours.length > 0) (this.input ? this.said : this.editor).setAttribute("open", "");
     fill(
       this.faults,
       ...ours.map((fault) => {
@@ -124,7 +155,8 @@ export class FieldChooser {
   }
 
   private example(example: Example, tell = true): void {
-    this.input = null;
+    this.choices++;
+    this.input = this.missing = null;
     this.fileName = null;
     this.name = example.name;
     this.scene.value = example.text;
@@ -152,25 +184,38 @@ export class FieldChooser {
   }
 
   private async read(file: File): Promise<void> {
+    const choice = ++this.choices;
     this.name = file.name.replace(/\.[^.]+$/, "");
+    this.missing = `The file ${file.name} is being read.`;
     this.faults.replaceChildren();
     this.examples.value = "";
     fill(this.described, el("p", {}, `${file.name} is being read`));
     if (/\.json$/i.test(file.name) && file.size <= MOST_SCENE_BYTES) {
-      this.input = null;
-      this.fileName = null;
-      this.scene.value = await file.text();
+      const text = await file.text();
+      if (choice !== this.choices) return;
+      this.input = this.fileName = this.missing = null;
+      this.scene.value = text;
       this.editor.hidden = false;
       this.editor.setAttribute("open", "");
       fill(this.described, el("p", {}, el("strong", {}, file.name), ", a scene that you may edit below"));
     } else {
       try {
-        this.input = await uploadInput(file);
+        this.changed();
+        const options = this.fieldOptions();
+        const input = await uploadInput(file, typeof options === "string" ? {} : options);
+        if (choice !== this.choices) return;
+        this.input = input;
+        this.missing = null;
         this.fileName = file.name;
         this.editor.hidden = true;
-        this.describe(file.name, this.input);
+        this.describe(file.name, input);
       } catch (error) {
+        if (choice !== this.choices) return;
+        this.input = null;
+        this.missing = `The file ${file.name} cannot be read as a field.`;
         fill(this.described, problemBox(problemOf(error)));
+        // what it lacks may be said
+        this.said.setAttribute("open", "");
       }
     }
     this.file.value = "";

@@ -69,6 +69,7 @@ export class JobForm {
   }
 
   private changed(): void {
+    fill(this.problem);
     this.code.refresh();
     this.latticeChanged(this.options.lattice);
     clearTimeout(this.timer);

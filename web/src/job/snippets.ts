@@ -1,5 +1,6 @@
 /** The same job as programs that can be run: curl, Python with requests, and Rust with reqwest. */
 
+import { readingQuery } from "../api/client";
 import type { JobRequest } from "../api/types";
 
 /** What a program needs to know to make a job. */
@@ -19,6 +20,11 @@ export type Language = (typeof LANGUAGES)[number];
 /** The program. */
 export function snippet(language: Language, recipe: Recipe): string {
   return { curl, Python: python, Rust: rust }[language](recipe);
+}
+
+/** Where the file is uploaded to. */
+function upload({ request }: Recipe): string {
+  return `/v1/inputs${readingQuery(request.field)}`;
 }
 
 /** The name a result is saved under. */
@@ -45,7 +51,7 @@ function curl(recipe: Recipe): string {
   const body = JSON.stringify(withPlaceholder(recipe), null, 2);
   const lines = [`BASE=${quoted(recipe.base)}`];
   if (recipe.file !== null) {
-    lines.push(`INPUT=$(curl -sS --fail-with-body${key} --data-binary @${quoted(recipe.file)} "$BASE/v1/inputs" | ${id})`);
+    lines.push(`INPUT=$(curl -sS --fail-with-body${key} --data-binary @${quoted(recipe.file)} "$BASE${upload(recipe)}" | ${id})`);
     // a body with the name of the input put in must be open to the shell, so what else it could read is guarded
     const open = body.replace(/[\\$`]/g, "\\$&").replace(PLACEHOLDER, "$INPUT");
     lines.push(`JOB=$(curl -sS --fail-with-body${key} -H 'content-type: application/json' --data-binary @- "$BASE/v1/jobs" <<JSON | ${id}`, open, "JSON", ")");
@@ -77,7 +83,7 @@ function python(recipe: Recipe): string {
     "",
     ...(recipe.file === null
       ? []
-      : [`with open(${JSON.stringify(recipe.file)}, "rb") as file:`, `    input_id = checked(session.post(f"{base}/v1/inputs", data=file)).json()["id"]`, ""]),
+      : [`with open(${JSON.stringify(recipe.file)}, "rb") as file:`, `    input_id = checked(session.post(f"{base}${upload(recipe)}", data=file)).json()["id"]`, ""]),
     `request = ${body}`,
     `job = checked(session.post(f"{base}/v1/jobs", json=request)).json()`,
     `while job["state"] not in ("succeeded", "failed", "canceled"):`,
@@ -133,7 +139,7 @@ function rust(recipe: Recipe): string {
       ? []
       : [
           `    let file = std::fs::read(${JSON.stringify(recipe.file)})?;`,
-          `    let described: Value = answer(client.post(format!("{base}/v1/inputs")).body(file))?.json()?;`,
+          `    let described: Value = answer(client.post(format!("{base}${upload(recipe)}")).body(file))?.json()?;`,
           `    let input = described["id"].as_str().ok_or("no id")?;`,
         ]),
     `    let request = json!(${body});`,

@@ -162,6 +162,24 @@ test("a mesh and a network are uploaded, described and wrapped", async ({ page, 
   await expect(page.getByRole("heading", { name: "blob" })).toBeVisible();
 });
 
+test("what a network's file does not say is said beside it", async ({ page, service }) => {
+  await openPage(page, service);
+  await page.getByText("What a file does not say").click();
+  const options = page.locator("#field-options");
+  await options.fill('{"w0": 12, "domain": {"min": [-0.9, -0.9, -0.9], "max": [0.9, 0.9, 0.9]}}');
+  await page.locator("#file").setInputFiles(join(FIXTURES, "networks/families/blob_siren.pth"));
+  await expect(page.locator(".described")).toContainText("siren");
+  await page.getByLabel("Size").selectOption("100x50");
+  await expect(page.locator(".cost")).toContainText("4,902 vertices");
+  await accessible(page);
+  const id = await submit(page);
+  await showsSurface(page);
+  const asked = (await (await fetch(`${service.api}/v1/jobs/${id}/request`)).json()) as { field: { w0: unknown } };
+  expect(asked.field.w0).toBe(12);
+  await options.fill("{");
+  await expect(page.locator(".cost")).toContainText("not JSON");
+});
+
 test("a dropped scene can be edited", async ({ page, service }) => {
   await openPage(page, service);
   const data = await page.evaluateHandle(() => {

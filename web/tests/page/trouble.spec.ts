@@ -30,6 +30,13 @@ test.describe("with refusals", () => {
     await page.locator("#file").setInputFiles({ name: "noise.ply", mimeType: "application/octet-stream", buffer: Buffer.from("no mesh at all") });
     await expect(page.locator(".described .problem")).toContainText(/unrecognized_input|malformed_input/);
     await accessible(page);
+    // what was chosen before is not sent in its place
+    await expect(page.locator(".cost")).toContainText("The file noise.ply cannot be read as a field");
+    await page.getByRole("button", { name: "Shrink a sphere onto it" }).click();
+    await expect(page.locator(".job-form > div > .problem")).toContainText("The file noise.ply cannot be read as a field");
+    await chooseExample(page, "Ellipsoid");
+    await expect(page.locator(".cost")).toContainText("4,902 vertices");
+    await expect(page.locator(".job-form > div > .problem")).toHaveCount(0);
   });
 
   test("a job that is not there is said to be so", async ({ page, service }) => {

@@ -31,6 +31,13 @@ describe("programs", () => {
     expect(snippet("Rust", FILE)).toContain('"input": input,');
   });
 
+  it("say what a file does not say when they upload it, too", () => {
+    const request = { field: { input: "sha256:0", w0: [30, 1], family: "siren", domain: "fit" } };
+    for (const language of ["curl", "Python", "Rust"] as const) {
+      expect(snippet(language, { ...FILE, request })).toContain("/v1/inputs?family=siren&w0=%5B30%2C1%5D");
+    }
+  });
+
   it("in Rust are compiled with the service's examples", async () => {
     const request = { field: { input: "sha256:0", latent_row: 1 }, shrink: { lattice: { octahedral: { n: 24 } }, relax_uv: true }, labels: { name: "blob" } };
     const program = snippet("Rust", { base: SCENE.base, request, file: "blob.safetensors", key: true });
