@@ -99,13 +99,18 @@ test.describe("with a service that is killed", () => {
     const mortal = await startService();
     try {
       await openPage(page, mortal);
-      await chooseExample(page, "Gear", "200x100");
+      // it runs for minutes, so that it has not ended when the service is killed
+      await page.getByRole("radio", { name: "Octahedral" }).check();
+      await page.getByLabel("Size").selectOption("other");
+      await page.getByLabel("Subdivisions of an edge").fill("400");
       await submit(page);
       await expect(page.locator(".figures dd").first()).not.toHaveText("\u2013");
       const again = page.waitForRequest((request) => request.url().endsWith("/events") && Number(request.headers()["last-event-id"]) > 0);
       await mortal.restart();
       await again;
-      await showsSurface(page);
+      // the end comes by the new stream
+      await page.locator(".job-head").getByRole("button", { name: "Cancel" }).click();
+      await reaches(page, "canceled");
     } finally {
       await mortal.stop();
     }
