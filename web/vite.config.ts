@@ -3,7 +3,7 @@ import { defineConfig } from "vitest/config";
 /** Where the service is that `npm run dev` and `npm run preview` speak to. */
 const service = process.env.SHRINKD_URL ?? "http://127.0.0.1:8080";
 const proxy = Object.fromEntries(
-  ["/v1", "/openapi.json", "/livez", "/readyz"].map((path) => [path, { target: service }]),
+  ["/v1", "/docs", "/openapi.json", "/livez", "/readyz"].map((path) => [path, { target: service }]),
 );
 
 export default defineConfig({

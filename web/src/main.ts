@@ -50,7 +50,7 @@ document.getElementById("app")!.replaceChildren(
     el(
       "div",
       { class: "tools" },
-      el("a", { href: "/openapi.json" }, "API"),
+      el("a", { href: "/docs/" }, "API"),
       el(
         "button",
         { type: "button", class: "small", onclick: async () => (await askForKey("The service may ask who its callers are.")) && list.refresh() },

@@ -213,9 +213,10 @@ export class FieldChooser {
         if (choice !== this.choices) return;
         this.input = null;
         this.missing = `The file ${file.name} cannot be read as a field.`;
-        fill(this.described, problemBox(problemOf(error)));
-        // what it lacks may be said
-        this.said.setAttribute("open", "");
+        const problem = problemOf(error);
+        fill(this.described, problemBox(problem));
+        // what it lacks may be said, where it is a file of a known kind
+        if (problem.code !== "unrecognized_input") this.said.setAttribute("open", "");
       }
     }
     this.file.value = "";
