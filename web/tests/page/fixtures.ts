@@ -57,6 +57,14 @@ export async function chooseExample(page: Page, name: string, size = "100x50"): 
   await page.getByLabel("Size").selectOption(size);
 }
 
+/** Chooses a job that takes longer than any test: the paper's loop on the finest lattice. */
+export async function chooseEndlessJob(page: Page): Promise<void> {
+  await chooseExample(page, "Ellipsoid", "other");
+  await page.getByRole("spinbutton", { name: "Columns" }).fill("2048");
+  await page.getByRole("spinbutton", { name: "Rows" }).fill("1024");
+  await page.getByRole("radio", { name: "Paper" }).check();
+}
+
 export async function submit(page: Page): Promise<string> {
   const answered = page.waitForResponse((answer) => answer.url().endsWith("/v1/jobs") && answer.request().method() === "POST");
   await page.getByRole("button", { name: "Shrink a sphere onto it" }).click();

@@ -5,6 +5,7 @@ import {
   accessible,
   changes,
   chartPicture,
+  chooseEndlessJob,
   chooseExample,
   expect,
   openPage,
@@ -131,9 +132,7 @@ test("what is pointed at in one picture is marked in both", async ({ page, servi
 
 test("a long job is cancelled, and sent again", async ({ page, service }) => {
   await openPage(page, service);
-  await page.getByRole("radio", { name: "Octahedral" }).check();
-  await page.getByLabel("Size").selectOption("other");
-  await page.getByLabel("Subdivisions of an edge").fill("400");
+  await chooseEndlessJob(page);
   const id = await submit(page);
   await reaches(page, "running");
   await accessible(page);

@@ -1,4 +1,4 @@
-import { accessible, chooseExample, expect, openPage, reaches, showsSurface, submit, test } from "./fixtures";
+import { accessible, chooseEndlessJob, chooseExample, expect, openPage, reaches, showsSurface, submit, test } from "./fixtures";
 import { startService } from "./service";
 
 test.describe("with refusals", () => {
@@ -99,10 +99,7 @@ test.describe("with a service that is killed", () => {
     const mortal = await startService();
     try {
       await openPage(page, mortal);
-      // it runs for minutes, so that it has not ended when the service is killed
-      await page.getByRole("radio", { name: "Octahedral" }).check();
-      await page.getByLabel("Size").selectOption("other");
-      await page.getByLabel("Subdivisions of an edge").fill("400");
+      await chooseEndlessJob(page);
       await submit(page);
       await expect(page.locator(".figures dd").first()).not.toHaveText("\u2013");
       const again = page.waitForRequest((request) => request.url().endsWith("/events") && Number(request.headers()["last-event-id"]) > 0);
