@@ -12,7 +12,7 @@ pub const EXAMPLES: &str = "\
 Examples:
   shrinkd describe bunny.ply
   shrinkd describe deepsdf_folder
-  shrinkd describe net.onnx --field-options '{\"output\": \"sdf\"}'
+  shrinkd describe weights.pth --field-options '{\"family\": \"siren\", \"w0\": 25}'
 
 Prints JSON: the member `description` of what POST /v1/inputs answers. Exits 0 when the file is a field, 2 on bad usage, 3 when it is none,
 with the cause.";
