@@ -1,6 +1,6 @@
 //! `shrinkd describe`: what a file is taken for, as the service answers an upload.
 
-use super::{BAD_INPUT, FAILED, FieldArgs, fail, faults};
+use super::{BAD_INPUT, FAILED, FieldArgs, fail, faults, print};
 use crate::job::failure::Failure;
 use crate::job::pipeline;
 use clap::Args;
@@ -30,7 +30,7 @@ pub struct DescribeArgs {
 pub fn run(args: &DescribeArgs) -> ExitCode {
     match describe(args) {
         Ok(text) => {
-            println!("{text}");
+            print(&format!("{text}\n"));
             ExitCode::SUCCESS
         }
         Err((code, error)) => fail(code, &error),
