@@ -7,7 +7,7 @@ use crate::settings::{Canceled, Settings};
 use glam::{DVec2, DVec3};
 use std::ops::ControlFlow;
 
-/// Pairs that are counted of one triangle with those after it: a surface that is folded all over has billions, which nobody wants to wait for.
+/// Pairs that are counted of one triangle with those after it: a surface that is folded all over has hundreds of millions, which nobody wants to wait for.
 const MOST: u32 = 1000;
 
 /// Triangles of a mesh that meet others.
